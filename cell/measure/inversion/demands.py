@@ -80,17 +80,13 @@ def require_whole(scan: Scan, pose: pin.SE3, nominal: NominalSurface, tolerance:
     allowed = min(tolerance.translation / 3, tolerance.rotation * nominal.radius)
     medians = _squares(scan, pose, nominal)
     departed = float(np.mean(~(np.abs(medians) <= allowed))) if len(medians) else 1.0
-    if not departed <= demands.departed:
+    share, most = 100 * departed, 100 * demands.departed
+    if not share <= most:
         raise RefusedError(
-            f"{100 * departed:.0f} % of the scanned area lies more than {1e3 * allowed:.2f} mm off the nominal "
-            f"surface, at most {100 * demands.departed:.0f} % may. Is the surface deformed, worn "
+            f"{share:.0f} % of the scanned area lies more than {1e3 * allowed:.2f} mm off the nominal "
+            f"surface, at most {most:.0f} % may. Is the surface deformed, worn "
             "or covered, is it another one, or is the calibration disturbed?",
-            Measured(
-                f"area more than {1e3 * allowed:.2f} mm off the surface",
-                100 * departed,
-                "%",
-                most=100 * demands.departed,
-            ),
+            Measured(f"area more than {1e3 * allowed:.2f} mm off the surface", share, "%", most=most),
         )
 
 
