@@ -167,10 +167,14 @@ ALLOWED = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """The highest square: it would lift a part by `height`, m, at least; its middle at `at` (3,), m, surface frame."""
+    """The highest square: it would lift a part by `height`, m, at least; its middle at `at` (3,), m, surface frame.
+
+    `seen` is the share of the surface below the part, as drawn, with a square that has points enough.
+    """
 
     height: float
     at: Array
+    seen: float
 
 
 def highest_standing(
@@ -187,8 +191,9 @@ def highest_standing(
     index, feet = nominal.feet(local)
     places = local[index]
     below = (places - surface_from_part.translation) @ surface_from_part.rotation
-    up = feet.normals @ surface_from_part.rotation[:, 2]
-    kept = feet.inner & (up > STEEPEST) & (np.abs(below[:, :2]) <= 0.5 * np.asarray(size)[:2]).all(axis=1)
+    axis, half = surface_from_part.rotation[:, 2], 0.5 * np.asarray(size)[:2]
+    up = feet.normals @ axis
+    kept = feet.inner & (up > STEEPEST) & (np.abs(below[:, :2]) <= half).all(axis=1)
     if not kept.any():
         return None
     line, lift, below, places = lines[index[kept]], (feet.heights / up)[kept], below[kept], places[kept]
@@ -197,8 +202,12 @@ def highest_standing(
     medians, middle, noise = (np.concatenate(of_all) for of_all in zip(*each, strict=True))
     if not len(medians):
         return None
+    drawn = nominal.samples[nominal.normals[nominal.sample_triangles] @ axis > STEEPEST]
+    drawn = (drawn - surface_from_part.translation) @ surface_from_part.rotation
+    face = np.unique(square_of(drawn[(np.abs(drawn[:, :2]) <= half).all(axis=1)]))
+    seen = np.isin(face, square_of(below[each[0][0]])).mean() if len(face) else 0.0
     best = int(np.argmax(middle - noise))
-    return Standing(float(middle[best] - noise[best]), places[medians[best]])
+    return Standing(float(middle[best] - noise[best]), places[medians[best]], float(seen))
 
 
 def square_of(places: Array, shift: tuple[int, ...] = (0, 0)) -> Indices:
@@ -241,9 +250,8 @@ def _medians(owner: Indices, values: Array, count: Indices) -> tuple[Indices, Ar
     return middle, values[middle]
 
 
-def require_bare(found: Standing | None, tolerance: float) -> None:
-    """Raise `RefusedError` for a place, of this `tolerance` in m, on which something stands that lifts the part, or of
-    which nothing was seen."""
+def require_bare(found: Standing | None, tolerance: float) -> Standing:
+    """What was found on a place of this `tolerance`, m; `RefusedError` where that lifts a part, or nothing was seen."""
     allowed = ALLOWED * tolerance
     if found is None:
         raise RefusedError(
@@ -251,7 +259,7 @@ def require_bare(found: Standing | None, tolerance: float) -> None:
             "that place.surface_from_part and grasp.size are right, or widen scan.swath or scan.length, and sweep again"
         )
     if found.height <= allowed:
-        return
+        return found
     x, y, z = 1e3 * found.at
     raise RefusedError(
         f"something stands {1e3 * found.height:.2f} mm out of the surface at ({x:.0f}, {y:.0f}, {z:.0f}) mm, as the "

@@ -355,13 +355,8 @@ def _still_there(workplace: Workplace, context: StepContext) -> VehicleArrival |
     try:
         workplace.mover.to(goal, "the photograph pose", within=NEAR)
         workplace.devices.clock.sleep(SETTLE_S)
-        found, near = _arrived(
-            workplace.job,
-            stand,
-            workplace.whereabouts,
-            workplace.photograph(),
-            note=lambda text: context.note(text=text),
-        )
+        fix = workplace.photograph()
+        found, near = _arrived(workplace.job, stand, workplace.whereabouts, fix, lambda text: context.note(text=text))
     except RefusedError as unseen:
         context.note(text=f"the board is not seen from where it was for the part before: {unseen}")
         return None

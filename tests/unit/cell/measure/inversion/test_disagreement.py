@@ -33,7 +33,7 @@ from drivers.errors import RefusedError
 from lab.bench.inversion.campaign import BOARD, TOLERANCE, judge_case, task
 from lab.bench.inversion.scenes import PARTS, TRUE, Setting, nominal, scan
 from lab.bench.job.whole_job import JobRecord, NoFrames
-from statemachine.runner import StepContext
+from statemachine.runner import Event, StepContext
 from tests.support.report_runs import CONFIG, at_station, pot, work_of
 
 Array = NDArray[np.float64]
@@ -180,16 +180,33 @@ def test_what_lies_beside_the_part_or_below_the_surface_does_not_lift_it(placed_
         assert found is not None and found.height < 0.1e-3
 
 
-def test_the_job_ends_before_anything_moves(placed_pot: JobRecord, tmp_path: Path) -> None:
+def placing(record: JobRecord, folder: Path, cloud: Cloud, notify: Callable[[Event], None]) -> str:
+    """Why the step that places after a scan of this `cloud` is refused, in the cell of `record`, before it moves."""
     job, nominal = pot()
-    cell = VirtualCell(CONFIG, placed_pot.seed, placed_pot.level)
-    at_station(cell, placed_pot)
-    work = work_of(cell, job, nominal, placed_pot, NoFrames(), tmp_path)
-    made = {name: result for name, result in placed_pot.results.items() if name != "place"}
-    made["reconstruct"] = replace(made["reconstruct"], cloud=with_chip(placed_pot, 1e-3))
-    context = StepContext(PLACE.policy().of("place"), 1, math.inf, made, cell.clock, lambda event: None)
+    cell = VirtualCell(CONFIG, record.seed, record.level)
+    at_station(cell, record)
+    work = work_of(cell, job, nominal, record, NoFrames(), folder)
+    made = {name: result for name, result in record.results.items() if name != "place"}
+    made["reconstruct"] = replace(made["reconstruct"], cloud=cloud)
+    context = StepContext(PLACE.policy().of("place"), 1, math.inf, made, cell.clock, notify)
     before = cell.clock.now()
-    with pytest.raises(RefusedError, match="Look what it is") as refused:
+    with pytest.raises(RefusedError) as refused:
         STEP.work(work, context)
-    assert re.search(r"at \(1[123], [456], \d+\) mm", str(refused.value))
     assert cell.clock.now() == before and cell.world.part.held
+    return str(refused.value)
+
+
+def test_the_job_ends_before_anything_moves(placed_pot: JobRecord, tmp_path: Path) -> None:
+    told = placing(placed_pot, tmp_path, with_chip(placed_pot, 1e-3), lambda event: None)
+    assert "Look what it is" in told and re.search(r"at \(1[123], [456], \d+\) mm", told)
+
+
+def test_a_place_of_which_little_was_scanned_is_told_of(placed_pot: JobRecord, tmp_path: Path) -> None:
+    def ended(event: Event) -> None:
+        raise RefusedError(str(event.data["text"]))
+
+    whole = placed_pot.results["reconstruct"].cloud
+    first = np.arange(whole.shape[0]) < whole.shape[0] // 3
+    third = replace(whole, points=np.where(first[:, None, None], whole.points, np.nan))
+    told = placing(placed_pot, tmp_path, third, ended)
+    assert re.match(r"2\d % of the surface below the part were scanned", told)

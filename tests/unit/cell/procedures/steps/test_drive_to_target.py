@@ -162,15 +162,11 @@ def test_a_target_in_the_table_is_not_driven_to() -> None:
 
 def test_a_way_is_checked_at_the_pace_at_which_it_is_driven() -> None:
     """A slow vehicle comes later to its line: nearer to what stands beside it."""
-    fixture = StationObstacle(
-        name="fixture",
-        size=("200 mm",) * 3,
-        place_from_centre=Pose(translation=("-1750 mm", "660 mm", "-500 mm"), rotation=("0 deg",) * 3),
-    )
+    stands = Pose(translation=("-1750 mm", "660 mm", "-500 mm"), rotation=("0 deg",) * 3)
+    fixture = StationObstacle(name="fixture", size=("200 mm",) * 3, place_from_centre=stands)
     approach = JOB.approach.model_copy(update={"speed": 0.2})
     job = JOB.model_copy(update={"approach": approach, "obstacle": (fixture,)})
-    site, pace = Site(), Pace()
-    stood = Planar(approach.start.translation[0], 0.45, 0.0)
+    site, pace, stood = Site(), Pace(), Planar(approach.start.translation[0], 0.45, 0.0)
     model = site.cell.world.vehicle
     model._x, model._y, model._yaw = stood.x, stood.y, stood.yaw
     site.cell.clock.sleep(0.1)

@@ -309,7 +309,6 @@ def test_a_head_that_moved_after_the_sweep_is_neither_a_push_nor_a_part_that_lie
 def test_a_laser_that_has_turned_since_the_calibration_leaves_open_no_more_than_one_that_has_not(
     placed_pot: JobRecord, lying: tuple[PlacedPart, LyingPart], tmp_path: Path
 ) -> None:
-    """It was seen on the plate before the sweep, and is known as well as there."""
     sweep = placed_pot.results["laser_sweep"]
     pointing = replace(sweep.pointing, turn=-0.25e-3)
     record = replace(placed_pot, results={**placed_pot.results, "laser_sweep": replace(sweep, pointing=pointing)})
