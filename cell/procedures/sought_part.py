@@ -20,9 +20,11 @@ def sought(job: Job, mesh: Path) -> tuple[Job, Path]:
     To be unloaded, the part's upper side is the surface: it lies where `place.surface_from_part` has it, and is gripped
     where it is found. The scan head keeps its distance from it. Other jobs stay as they are.
     """
-    if not job.unloads or job.part is None or job.surface.mesh == job.part.mesh:
+    lies = job.place.surface_from_part.se3()
+    # A part that lies on one like it has the same mesh, and is not sought yet.
+    if not job.unloads or job.part is None or (job.surface.mesh == job.part.mesh and lies == pin.SE3.Identity()):
         return job, mesh
-    there = job.surface.place_from_surface.se3() * job.place.surface_from_part.se3()
+    there = job.surface.place_from_surface.se3() * lies
     surface = job.surface.model_copy(
         update={"mesh": job.part.mesh, "mesh_unit": job.part.mesh_unit, "place_from_surface": pose_record(there)}
     )

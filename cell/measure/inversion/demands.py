@@ -19,7 +19,8 @@ BOARD_DISAGREES = 40.0
 five in ten million by chance)."""
 
 SQUARE, SQUARE_POINTS = 0.004, 8
-"""Edge of the squares over which distances are taken together, m, and the points that one needs to count."""
+"""Edge of the squares over which distances are taken together, m, and the points that one needs to count. Where a
+scan is so wide that they would hold few points, the squares are larger."""
 
 
 @dataclass(frozen=True)
@@ -79,17 +80,13 @@ def require_whole(scan: Scan, pose: pin.SE3, nominal: NominalSurface, tolerance:
     allowed = min(tolerance.translation / 3, tolerance.rotation * nominal.radius)
     medians = _squares(scan, pose, nominal)
     departed = float(np.mean(~(np.abs(medians) <= allowed))) if len(medians) else 1.0
-    if not departed <= demands.departed:
+    share, most = 100 * departed, 100 * demands.departed
+    if not share <= most:
         raise RefusedError(
-            f"{100 * departed:.0f} % of the scanned area lies more than {1e3 * allowed:.2f} mm off the nominal "
-            f"surface, at most {100 * demands.departed:.0f} % may. Is the surface deformed, worn "
+            f"{share:.0f} % of the scanned area lies more than {1e3 * allowed:.2f} mm off the nominal "
+            f"surface, at most {most:.0f} % may. Is the surface deformed, worn "
             "or covered, is it another one, or is the calibration disturbed?",
-            Measured(
-                f"area more than {1e3 * allowed:.2f} mm off the surface",
-                100 * departed,
-                "%",
-                most=100 * demands.departed,
-            ),
+            Measured(f"area more than {1e3 * allowed:.2f} mm off the surface", share, "%", most=most),
         )
 
 
@@ -112,13 +109,15 @@ def require_agreement(found: Dissent, tolerance: Tolerance, demands: Demands) ->
 
 
 def _squares(scan: Scan, pose: pin.SE3, nominal: NominalSurface) -> Array:
-    """Median distances (k,) in m from the surface over squares of `SQUARE` m that hold enough points."""
+    """Median distances (k,) in m from the surface over squares of `SQUARE` m or more that hold enough points."""
     local = (scan.points - pose.translation) @ pose.rotation
     index, feet = nominal.feet(local, 0.006)
     index, heights = index[feet.inner], feet.heights[feet.inner]
     if len(index) == 0:
         return np.empty(0)
-    cells = np.floor(local[index] @ across(nominal)[1].T / SQUARE).astype(np.intp)
+    places = local[index] @ across(nominal)[1].T
+    edge = max(SQUARE, float(np.sqrt(2 * SQUARE_POINTS * np.prod(np.ptp(places, axis=0)) / len(places))))
+    cells = np.floor(places / edge).astype(np.intp)
     _, owner, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     groups = np.split(heights[np.argsort(owner, kind="stable")], np.cumsum(count)[:-1])
     return np.array([np.median(group) for group in groups if len(group) >= SQUARE_POINTS])

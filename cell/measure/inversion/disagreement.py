@@ -152,7 +152,7 @@ def _own_place(heights: Array, slopes: Array, sigmas: Array, by_calibration: Arr
 
 
 REACH_M = 6e-3
-"""What stands higher is felt on the way down."""
+"""Farther from what is drawn, part or surface, a point belongs to something else."""
 SQUARE_M, LEAST_POINTS, LEAST_LINES = 2e-3, 8, 2
 """Squares over which heights are taken together, and what one needs to count: a single line may be a reflection."""
 ROWS = 100_000
@@ -167,10 +167,14 @@ ALLOWED = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """The highest square: it would lift a part by `height`, m, at least; its middle at `at` (3,), m, surface frame."""
+    """The highest square: it would lift a part by `height`, m, at least; its middle at `at` (3,), m, surface frame.
+
+    `seen` is the share of the surface below the part, as drawn, with a square that has points enough.
+    """
 
     height: float
     at: Array
+    seen: float
 
 
 def highest_standing(
@@ -183,34 +187,27 @@ def highest_standing(
     """
     lines, rows = np.nonzero(cloud.valid)
     local = (cloud.points[lines, rows] - pose.translation) @ pose.rotation
-    index, feet = nominal.feet(local, REACH_M)
-    below = (feet.points - surface_from_part.translation) @ surface_from_part.rotation
-    up = feet.normals @ surface_from_part.rotation[:, 2]
-    kept = feet.inner & (up > STEEPEST) & (np.abs(below[:, :2]) <= 0.5 * np.asarray(size)[:2]).all(axis=1)
+    # However high: the part comes down onto it from above all of it.
+    index, feet = nominal.feet(local)
+    places = local[index]
+    below = (places - surface_from_part.translation) @ surface_from_part.rotation
+    axis, half = surface_from_part.rotation[:, 2], 0.5 * np.asarray(size)[:2]
+    up = feet.normals @ axis
+    kept = feet.inner & (up > STEEPEST) & (np.abs(below[:, :2]) <= half).all(axis=1)
     if not kept.any():
         return None
-    line, lift, below = lines[index[kept]], (feet.heights / up)[kept], below[kept]
-    places = local[index[kept]]
-    found = None
+    line, lift, below, places = lines[index[kept]], (feet.heights / up)[kept], below[kept], places[kept]
     # Squares that overlap by half: in some of them a small thing is in the middle.
-    for shift in np.ndindex(2, 2):
-        if (highest := _highest(square_of(below, shift), lift, line)) is not None and (
-            found is None or highest[1] > found.height
-        ):
-            found = Standing(highest[1], places[highest[0]])
-    return found
-
-
-def _highest(square: Indices, lift: Array, line: Indices) -> tuple[int, float] | None:
-    """Of the squares (n,) with points enough the highest: the point of its median, and its height less noise.
-
-    None where no square has enough.
-    """
-    medians, middle, noise = squares(square, lift, line)
+    each = [squares(square_of(below, shift), lift, line) for shift in np.ndindex(2, 2)]
+    medians, middle, noise = (np.concatenate(of_all) for of_all in zip(*each, strict=True))
     if not len(medians):
         return None
+    drawn = nominal.samples[nominal.normals[nominal.sample_triangles] @ axis > STEEPEST]
+    drawn = (drawn - surface_from_part.translation) @ surface_from_part.rotation
+    face = np.unique(square_of(drawn[(np.abs(drawn[:, :2]) <= half).all(axis=1)]))
+    seen = np.isin(face, square_of(below[each[0][0]])).mean() if len(face) else 0.0
     best = int(np.argmax(middle - noise))
-    return int(medians[best]), float(middle[best] - noise[best])
+    return Standing(float(middle[best] - noise[best]), places[medians[best]], float(seen))
 
 
 def square_of(places: Array, shift: tuple[int, ...] = (0, 0)) -> Indices:
@@ -253,11 +250,16 @@ def _medians(owner: Indices, values: Array, count: Indices) -> tuple[Indices, Ar
     return middle, values[middle]
 
 
-def require_bare(found: Standing | None, tolerance: float) -> None:
-    """Raise `RefusedError` for a place, of this `tolerance` in m, on which something stands that lifts the part."""
+def require_bare(found: Standing | None, tolerance: float) -> Standing:
+    """What was found on a place of this `tolerance`, m; `RefusedError` where that lifts a part, or nothing was seen."""
     allowed = ALLOWED * tolerance
-    if found is None or found.height <= allowed:
-        return
+    if found is None:
+        raise RefusedError(
+            "the scan shows nothing of the surface below the part: whether something stands there is not known. See "
+            "that place.surface_from_part and grasp.size are right, or widen scan.swath or scan.length, and sweep again"
+        )
+    if found.height <= allowed:
+        return found
     x, y, z = 1e3 * found.at
     raise RefusedError(
         f"something stands {1e3 * found.height:.2f} mm out of the surface at ({x:.0f}, {y:.0f}, {z:.0f}) mm, as the "

@@ -12,12 +12,10 @@ import pinocchio as pin
 import scipy
 
 from cell.measure.geometry.poses import transform
-from cell.measure.inversion.disagreement import STEEPEST, spread_for_journal, spread_mm, square_of, squares
+from cell.measure.inversion.disagreement import REACH_M, STEEPEST, spread_for_journal, spread_mm, square_of, squares
 from cell.measure.inversion.nominal import Array, Indices, NominalSurface
 from cell.measure.reconstruction.cloud import Cloud
 
-REACH_M = 6e-3
-"""Farther from what is drawn a point belongs to something else."""
 UPRIGHT_M = 0.5e-3
 """So far at most is a point, moved down or up by what it is higher, from what is drawn there."""
 BESIDE_M = 6e-3

@@ -137,7 +137,9 @@ def collect_scan(
         for other in aim.instead_of(view) if seen is None else ():
             check()
             progress(k / len(views), f"fine board, view {k + 1} of {len(views)}, aimed anew")
-            if _can_move(devices, mover, other, k):
+            # It was not planned: out of reach, or not to be reached without touching something, it is left out.
+            with suppress(RefusedError):
+                move_to_view(devices, mover, other, k)
                 seen = look_for(camera, board, refusals, keep, f"{what}-again")
             if seen is not None:
                 break
@@ -199,15 +201,6 @@ def collect_target(
 def move_to_view(devices: Devices, mover: Mover, view: CalibrationView, k: int) -> None:
     """To a view; after a stop that a program may clear, once more."""
     moved_once_more(devices.arm, lambda: mover.to(view.base_from_flange, f"calibration view {k + 1}"))
-
-
-def _can_move(devices: Devices, mover: Mover, view: CalibrationView, k: int) -> bool:
-    """To a view that was not planned; False when it cannot be reached, or not without touching something."""
-    try:
-        move_to_view(devices, mover, view, k)
-    except RefusedError:
-        return False
-    return True
 
 
 def look_for(camera: Camera, board: BoardSpec, refusals: Counter[str], keep: Keep, what: str) -> BoardView | None:

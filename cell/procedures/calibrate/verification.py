@@ -47,7 +47,7 @@ from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import CalibrationView, ScanPlan, rail_ends, references, verification_views
 from cell.procedures.calibrate.boards import PHOTO_RATE, Check, Keep, Progress, look_for, move_to_view
-from cell.procedures.calibrate.reference_plate import require_reference_plate
+from cell.procedures.calibrate.reference_plate import ROOM_M, require_reference_plate
 from cell.procedures.frame_store import Cut
 from cell.procedures.sweep.swath import SweepCollector, SweepErrors, warm_up
 from cell.procedures.sweep.sweeping import home_rail, rail_sweep
@@ -160,7 +160,8 @@ def _stripe(
 SCAN_APPROACHES, TARGET_APPROACHES = 2, 6
 BACK_M = 0.02
 """How far the flange leaves a view, each time another way, before it approaches it again."""
-SWEEP_SPEED, SWEEP_RATE = "12 mm/s", "10 Hz"
+SWEEP_SPEED, SWEEP_RATE = 0.012, "10 Hz"
+"""The speed in m/s, where the rail can go as fast."""
 MAX_SHIFT = 0.15e-3
 """Farthest, in m, that the sweep may lie off because of its times: less than the changes that are looked for."""
 
@@ -176,7 +177,9 @@ def collect_verification(
     fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
     scan_view, target_view = verification_views(config, fine, large, calibration.scan, calibration.target)
     near, _ = references(calibration.scan, calibration.target)
-    ends = rail_ends(calibration.scan, near.base_from_board, scan_view, fine, config.rail.travel)
+    room = SWEEP_SPEED**2 / (2 * config.rail.acceleration) + ROOM_M
+    low, high = config.rail.travel
+    ends = rail_ends(calibration.scan, near.base_from_board, scan_view, fine, (low + room, high - room))
     home_rail(devices, progress)
     mover.to_joints(HOME)
     pointing = None
@@ -231,8 +234,9 @@ def _sweep(
 ) -> list[ScanObservation]:  # fmt: skip
     """To the view and over the board's plate from end to end."""
     length, exposure = f"{1e3 * (ends[1] - ends[0])} mm", f"{1e3 * config.calibration.stripe_exposure} ms"
+    speed = f"{1e3 * min(SWEEP_SPEED, config.rail.max_speed)} mm/s"
     section = ScanSection.model_validate({
-        "stand_off": "130 mm", "length": length, "speed": SWEEP_SPEED, "frame_rate": SWEEP_RATE, "exposure": exposure,
+        "stand_off": "130 mm", "length": length, "speed": speed, "frame_rate": SWEEP_RATE, "exposure": exposure,
     })  # fmt: skip
     profiles: list[StripeProfile] = []
     plan = ScanPlan(view.base_from_flange, view.base_from_flange, *ends)

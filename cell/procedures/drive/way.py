@@ -177,7 +177,6 @@ ROOM_ABOVE = 0.03
 """What passes above or below something by more than this, m, does not meet it: floors are that even."""
 _STEP_S = 0.05
 _STEP_TURN = math.radians(2)
-_LONGEST_S = 120.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,13 +278,13 @@ class Way:
             ways.append(math.hypot(leave.x - begin.x, leave.y - begin.y) + round_to)
         self.longest = max(ways) + ROOM_BEYOND
 
-    def require_line(self, goal: Planar) -> Planar:
-        """Where the vehicle comes to stand that drives along the goal's line to `goal` on odometry; raises
-        `RefusedError` unless it may."""
+    def require_line(self, goal: Planar, share: float = 1.0) -> Planar:
+        """Where the vehicle comes to stand that drives along the goal's line to `goal` on odometry, at this `share` of
+        its speed: a slow one steers less. Raises `RefusedError` unless it may."""
         pose, length, turned = self._whereabouts.pose(), self._whereabouts.way, self._whereabouts.turned
-        fastest = speed_onto(self._job, goal.inverse() * pose)
+        fastest = speed_onto(self._job, goal.inverse() * pose) * share
         self._require_room(pose, length, turned)
-        for _ in range(round(_LONGEST_S / _STEP_S)):
+        while length <= self.longest:
             speed, rate = line_command(pose, goal, fastest)
             if speed == 0.0:
                 break
@@ -293,6 +292,7 @@ class Way:
             length += abs(speed) * _STEP_S
             self._require_room(pose, length, turned)
         if length > self.longest:
+            length += abs((goal.inverse() * pose).x)
             raise RefusedError(
                 f"the vehicle would go {length:.2f} m on odometry alone since it was last seen, allowed "
                 f"{self.longest:.2f} m; bring it where it sees the board, with `cell jog vehicle`"

@@ -189,8 +189,9 @@ class TargetDrive:
     def _go(self, goal: Planar) -> None:
         self._sent = goal
         self.hold()
-        self._way.require_line(goal)
-        speed = speed_onto(self.job, goal.inverse() * self.whereabouts.pose()) * self.pace.share
+        share = self.pace.share
+        self._way.require_line(goal, share)
+        speed = speed_onto(self.job, goal.inverse() * self.whereabouts.pose()) * share
         drive_line(self.vehicle, self.whereabouts, goal, speed=speed, clock=self.clock, check=self.check)
 
     def _photograph(self) -> BoardFix:
@@ -354,13 +355,8 @@ def _still_there(workplace: Workplace, context: StepContext) -> VehicleArrival |
     try:
         workplace.mover.to(goal, "the photograph pose", within=NEAR)
         workplace.devices.clock.sleep(SETTLE_S)
-        found, near = _arrived(
-            workplace.job,
-            stand,
-            workplace.whereabouts,
-            workplace.photograph(),
-            note=lambda text: context.note(text=text),
-        )
+        fix = workplace.photograph()
+        found, near = _arrived(workplace.job, stand, workplace.whereabouts, fix, lambda text: context.note(text=text))
     except RefusedError as unseen:
         context.note(text=f"the board is not seen from where it was for the part before: {unseen}")
         return None

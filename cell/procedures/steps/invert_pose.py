@@ -110,7 +110,7 @@ def inverted(workplace: Workplace, sweep: SweepRecord, scan: Reconstruction, fix
     """`invert_pose` where a job is done."""
     head = None
     if workplace.job.scan.mode == "rail":
-        known, travel = workplace.calibration.scan, workplace.config.rail.travel[1]
+        known, travel = workplace.calibration.scan, max(map(abs, workplace.config.rail.travel))
         head = Head.of(scan.cloud, sweep.base_from_flange, known.flange_from_camera, known.rail_direction, travel)
     taken = LineTimes(sweep.times, workplace.config.arm.vehicle_from_base.se3().inverse(), head)
     try:

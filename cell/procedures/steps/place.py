@@ -11,7 +11,7 @@ from cell.measure.geometry.poses import from_parts, from_ur, to_ur
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.disagreement import highest_standing, require_bare
 from cell.measure.inversion.effects.between_sweeps import Creep
-from cell.measure.inversion.mating import APART, NEXT_STEP, MatingGap, scanned_gap
+from cell.measure.inversion.mating import APART, LEAST_SEEN, NEXT_STEP, MatingGap, scanned_gap
 from cell.motion.collision import TOUCHES
 from cell.procedures.arm.moves import Mover, PartProgress, PartState
 from cell.procedures.arm.photograph import BoardFix
@@ -428,8 +428,11 @@ def _looked_again(workplace: Workplace, pose: PlacePose, context: StepContext) -
         require_board_unmoved(workplace, fix, "before its place was measured", context.progress)
         return None
     lies = workplace.job.place.surface_from_part.se3()
-    found = highest_standing(scan.cloud, workplace.nominal, pose.base_from_surface, lies, workplace.job.grasp.size)
-    require_bare(found, workplace.job.place.tolerance)
+    highest = highest_standing(scan.cloud, workplace.nominal, pose.base_from_surface, lies, workplace.job.grasp.size)
+    found = require_bare(highest, workplace.job.place.tolerance)
+    if found.seen < LEAST_SEEN:
+        rest = f"{100 * found.seen:.0f} % of the surface below the part were scanned (at least {100 * LEAST_SEEN:.0f} %"
+        context.note(text=f"{rest} tell): what stands on the rest is not seen. Widen scan.swath or scan.length")
     return require_in_place(workplace, fix, sweep, scan=scan, pose=pose, context=context)
 
 

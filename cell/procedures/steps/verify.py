@@ -130,6 +130,7 @@ def _looked(
     over = pose.base_from_surface * surface_from_faces(workplace.job, faces)
     lying = PartOnGround(faces, pose.base_from_surface * belongs, (workplace.nominal, pose.base_from_surface))
     cloud, record = swept_part(workplace, head_at(workplace, sweep), over, context, lying=lying)
+    record = replace(record, pointing=sweep.pointing, slip=sweep.slip)
     try:
         seen = find_part(
             cloud, faces, workplace.nominal, surface=Prior(pose.base_from_surface, pose.covariance), belongs=belongs,

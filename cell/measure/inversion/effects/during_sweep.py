@@ -25,6 +25,8 @@ from drivers.errors import Measured, RefusedError
 
 SLOWEST_HZ, FASTEST_HZ, STEP_HZ = 1.5, 14.0, 0.05
 LEAST_LINES = 40
+LEAST_POINTS, POINTS = 8, 40
+"""Of a line that counts; of each line that are looked at, in a dense scan."""
 FEWEST = 20
 """Lines of one sweep of several that tell something."""
 EVIDENCE = 40.0
@@ -59,11 +61,11 @@ def find_rocking(cloud: Cloud, nominal: NominalSurface, base_from_surface: pin.S
 
     None as well where the lines go up and down with overtones: a vehicle on its springs has none, ridges have.
     """
-    scan = Scan.of(cloud)
+    scan = Scan.of(cloud, max(10_000, POINTS * cloud.shape[0]))
     rows = correspondences(base_from_surface, scan, nominal, GATE_M)
     of = scan.lines[rows.index]
     count = np.bincount(of, minlength=cloud.shape[0])
-    good = count >= 8
+    good = count >= LEAST_POINTS
     mean = np.bincount(of, rows.heights, minlength=cloud.shape[0])[good] / count[good]
     sums = [np.bincount(of, scan.points[rows.index, axis], minlength=len(good)) for axis in range(3)]
     places = np.column_stack(sums)[good] / count[good, None]
@@ -216,14 +218,14 @@ def _waves(t: Array, hz: float) -> Array:
 
 
 LEAST_DROOP_LINES, LEAST_SHARE = 40, 0.1
-LEAST_POINTS = 8
 LEAST_SAG = 36e-6
 """At the end of the travel, m. Calibration and facets make a bow of up to 33 µm (docs/explanation/theory.md, section
 8)."""
 DROOP_EVIDENCE = 4.0
 """The bow over its own standard deviation."""
-BLOCK = 12
-"""Neighbouring lines whose errors count as one: they share facets of the drawing and the part's form."""
+BLOCK, BLOCKS = 12, 20
+"""Neighbouring lines whose errors count as one, and how many such blocks a dense scan has: they share facets of the
+drawing and the part's form."""
 ROLL = 10.0
 """How far the carriage rolls about its way while it sinks, rad per m: guides 0.1 m apart, of which one is worn."""
 
@@ -287,7 +289,7 @@ def find_droop(cloud: Cloud, nominal: NominalSurface, base_from_surface: pin.SE3
 
 def bow(cloud: Cloud, nominal: NominalSurface, pose: pin.SE3, head: Head) -> tuple[float, float] | None:
     """The sag that fits best and its standard deviation, m; each sweep may lie and lean by itself."""
-    scan = Scan.of(cloud)
+    scan = Scan.of(cloud, max(10_000, POINTS * cloud.shape[0]))
     found = correspondences(pose, scan, nominal, GATE_M)
     of = scan.lines[found.index]
     facing = np.einsum("ni,ni->n", found.normals, head.axes[of])
@@ -305,6 +307,6 @@ def bow(cloud: Cloud, nominal: NominalSurface, pose: pin.SE3, head: Head) -> tup
     sizes = inverse @ off
     left = off - columns @ sizes
     # What neighbouring lines share counts once.
-    blocks = np.arange(len(off)) // BLOCK
+    blocks = np.arange(len(off)) // max(BLOCK, len(off) // BLOCKS)
     moved = np.array([inverse[0, blocks == k] @ left[blocks == k] for k in range(blocks[-1] + 1)])
     return float(sizes[0]), float(np.linalg.norm(moved))

@@ -36,6 +36,16 @@ def test_a_part_to_be_unloaded_is_sought_by_its_upper_side_where_it_lies() -> No
     assert sought(found, file) == (found, file), "once is enough"
 
 
+def test_a_part_on_one_like_it_is_sought_where_it_lies() -> None:
+    assert JOB.part is not None
+    higher = JOB.place.surface_from_part.model_copy(update={"translation": (0.0, 0.0, 0.02)})
+    place = JOB.place.model_copy(update={"surface_from_part": higher})
+    surface = JOB.surface.model_copy(update={"mesh": JOB.part.mesh})
+    found, file = sought(changed(place=place, surface=surface), Path(JOB.part.mesh))
+    assert np.allclose(found.surface.place_from_surface.translation, (0.0, 0.0, 0.02))
+    assert sought(found, file) == (found, file)
+
+
 def test_other_jobs_seek_their_surface() -> None:
     for name in ("pot", "shell"):
         job, mesh = load_job(name)

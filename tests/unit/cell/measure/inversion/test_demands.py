@@ -5,13 +5,15 @@ from types import SimpleNamespace as Told
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from cell.config.job import load_job
-from cell.measure.inversion import Demands, Tolerance
-from cell.measure.inversion.demands import require_agreement, require_board, require_fit
+from cell.measure.inversion import Demands, NominalSurface, Tolerance
+from cell.measure.inversion.demands import require_agreement, require_board, require_fit, require_whole
 from cell.measure.inversion.effects.between_sweeps import SurfaceMotion
 from cell.measure.inversion.effects.during_sweep import require_firm
+from cell.measure.inversion.nominal import Scan
 from cell.procedures.arm.photograph import _require
 from cell.procedures.sweep.second_look import require_surface_unmoved
 from cell.procedures.sweep.swath import SweepErrors, TimeBound, shift_by_times
@@ -43,3 +45,15 @@ def test_a_figure_that_is_no_number_is_refused(good: float, gate: Gate) -> None:
     gate(good)
     with pytest.raises((RefusedError, DeviceFault)):
         gate(float("nan"))
+
+
+def test_a_wide_surface_is_as_whole_as_it_was_seen() -> None:
+    """As few points to its area as 10,000 are on 0.6 m by 0.3 m: one to a square of 4 mm."""
+    corners = np.array([[0.0, 0.0, 0.0], [0.06, 0.0, 0.0], [0.06, 0.03, 0.0], [0.0, 0.03, 0.0]])
+    plate, nothing = NominalSurface(corners, np.array([[0, 1, 2], [0, 2, 3]])), np.zeros((120, 3))
+    points = np.random.default_rng(0).uniform((0.001, 0.001, 0.0), (0.059, 0.029, 0.0), (120, 3))
+    scan = Scan(points, nothing, nothing, np.arange(120))
+    require_whole(scan, pin.SE3.Identity(), plate, TOLERANCE, ALLOWED)
+    points[points[:, 0] < 0.03, 2] = 1e-3
+    with pytest.raises(RefusedError, match=r"[45]\d % of the scanned area lies more than"):
+        require_whole(scan, pin.SE3.Identity(), plate, TOLERANCE, ALLOWED)

@@ -33,7 +33,7 @@ from drivers.errors import RefusedError
 from lab.bench.inversion.campaign import BOARD, TOLERANCE, judge_case, task
 from lab.bench.inversion.scenes import PARTS, TRUE, Setting, nominal, scan
 from lab.bench.job.whole_job import JobRecord, NoFrames
-from statemachine.runner import StepContext
+from statemachine.runner import Event, StepContext
 from tests.support.report_runs import CONFIG, at_station, pot, work_of
 
 Array = NDArray[np.float64]
@@ -159,6 +159,20 @@ def test_a_chip_of_three_millimetres_is_seen_as_high_as_it_is(
     assert number.value > number.most == pytest.approx(0.3)
 
 
+def test_what_stands_higher_than_the_part_is_seen_too_and_a_place_that_was_not_seen_is_not_bare() -> None:
+    job, cloud = pot()[0], scan(PARTS["pot"], np.random.default_rng(3))
+    local = (cloud.points - TRUE.translation) @ TRUE.rotation
+    on_bolt = np.abs(local[..., :2] - 0.004).max(axis=-1) < 0.005
+    cloud.points[on_bolt] += 0.02 * TRUE.rotation[:, 2]
+    found = highest_standing(cloud, nominal("pot"), TRUE, from_parts((0.0, 0.0, 0.0)), job.grasp.size)
+    assert found is not None and found.height == pytest.approx(0.02, abs=2e-3)
+    with pytest.raises(RefusedError, match="something stands"):
+        require_bare(found, job.place.tolerance)
+    aside = highest_standing(cloud, nominal("pot"), TRUE, from_parts((0.2, 0.0, 0.0)), job.grasp.size)
+    with pytest.raises(RefusedError, match=r"nothing of the surface below the part.*scan\.swath"):
+        require_bare(aside, job.place.tolerance)
+
+
 def test_what_lies_beside_the_part_or_below_the_surface_does_not_lift_it(placed_pot: JobRecord) -> None:
     beside = standing(placed_pot, with_chip(placed_pot, 1e-3), aside=-0.03)
     hollow = standing(placed_pot, with_chip(placed_pot, -1e-3))
@@ -166,16 +180,33 @@ def test_what_lies_beside_the_part_or_below_the_surface_does_not_lift_it(placed_
         assert found is not None and found.height < 0.1e-3
 
 
-def test_the_job_ends_before_anything_moves(placed_pot: JobRecord, tmp_path: Path) -> None:
+def placing(record: JobRecord, folder: Path, cloud: Cloud, notify: Callable[[Event], None]) -> str:
+    """Why the step that places after a scan of this `cloud` is refused, in the cell of `record`, before it moves."""
     job, nominal = pot()
-    cell = VirtualCell(CONFIG, placed_pot.seed, placed_pot.level)
-    at_station(cell, placed_pot)
-    work = work_of(cell, job, nominal, placed_pot, NoFrames(), tmp_path)
-    made = {name: result for name, result in placed_pot.results.items() if name != "place"}
-    made["reconstruct"] = replace(made["reconstruct"], cloud=with_chip(placed_pot, 1e-3))
-    context = StepContext(PLACE.policy().of("place"), 1, math.inf, made, cell.clock, lambda event: None)
+    cell = VirtualCell(CONFIG, record.seed, record.level)
+    at_station(cell, record)
+    work = work_of(cell, job, nominal, record, NoFrames(), folder)
+    made = {name: result for name, result in record.results.items() if name != "place"}
+    made["reconstruct"] = replace(made["reconstruct"], cloud=cloud)
+    context = StepContext(PLACE.policy().of("place"), 1, math.inf, made, cell.clock, notify)
     before = cell.clock.now()
-    with pytest.raises(RefusedError, match="Look what it is") as refused:
+    with pytest.raises(RefusedError) as refused:
         STEP.work(work, context)
-    assert re.search(r"at \(1[123], [456], \d+\) mm", str(refused.value))
     assert cell.clock.now() == before and cell.world.part.held
+    return str(refused.value)
+
+
+def test_the_job_ends_before_anything_moves(placed_pot: JobRecord, tmp_path: Path) -> None:
+    told = placing(placed_pot, tmp_path, with_chip(placed_pot, 1e-3), lambda event: None)
+    assert "Look what it is" in told and re.search(r"at \(1[123], [456], \d+\) mm", told)
+
+
+def test_a_place_of_which_little_was_scanned_is_told_of(placed_pot: JobRecord, tmp_path: Path) -> None:
+    def ended(event: Event) -> None:
+        raise RefusedError(str(event.data["text"]))
+
+    whole = placed_pot.results["reconstruct"].cloud
+    first = np.arange(whole.shape[0]) < whole.shape[0] // 3
+    third = replace(whole, points=np.where(first[:, None, None], whole.points, np.nan))
+    told = placing(placed_pot, tmp_path, third, ended)
+    assert re.match(r"2\d % of the surface below the part were scanned", told)

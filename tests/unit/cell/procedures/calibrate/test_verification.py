@@ -1,6 +1,7 @@
 """A laser that turned: what a verification's board confirms is kept for jobs, what the plate alone tells is stated."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,13 +11,14 @@ from typer.testing import CliRunner
 
 from cell.apps.cli.app import app
 from cell.config.calibrations.store import CellCalibration, read_calibration, save_calibration
-from cell.config.cell_config import load_config
+from cell.config.cell_config import CellConfig, load_config
 from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, Pointing
 from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Mover
-from cell.procedures.calibrate.verification import Verification, collect_verification, keep_confirmed
+from cell.procedures.calibrate.verification import CheckObservations, Verification, collect_verification, keep_confirmed
+from drivers.errors import RefusedError
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from sim_backends.world import levels
 from sim_backends.world.scene import draw
@@ -53,15 +55,17 @@ def test_it_is_stored_and_what_is_no_turn_is_not_read() -> None:
             ConfirmedTurn.read(vars(TURN) | spoilt)
 
 
-def verified(calibration: CellCalibration, seed: int) -> Verification:
-    """The cell of `seed` after it has stood for an hour."""
-    cell = VirtualCell(CONFIG, seed, LEVEL)
+def collected(
+    calibration: CellCalibration, seed: int, config: CellConfig = CONFIG, check: Callable[[], None] = lambda: None
+) -> CheckObservations:
+    """What a verification sees of the cell of `seed` after it has stood for an hour."""
+    cell = VirtualCell(config, seed, LEVEL)
     cell.world.stand(STOOD_S)
     cell.devices.interlocks.work_with(calibration.configuration)
     cell.devices.vehicle.brake()
-    mover = Mover(cell.devices.arm, cell.clock, CONFIG, JOB)
-    given = CONFIG, cell.devices, mover, calibration, lambda: None, lambda f, t: None, lambda what, frame: None
-    return Verification.of(calibration, JOB, collect_verification(*given))
+    mover = Mover(cell.devices.arm, cell.clock, config, JOB)
+    given = config, cell.devices, mover, calibration, check, lambda f, t: None, lambda what, frame: None
+    return collect_verification(*given)
 
 
 @pytest.fixture
@@ -69,7 +73,20 @@ def turned(placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch) -> tuple[Veri
     """A verification of a cell whose laser has turned by half a milliradian, and by how much, rad."""
     monkeypatch.setattr(levels, "ALONE", replace(levels.ALONE, laser_pointing=80e-6))
     true = abs(draw(placed_pot.seed, LEVEL).workshop.pointing) * (1 - np.exp(-STOOD_S / levels.WARMING_S))
-    return verified(placed_pot.calibration, placed_pot.seed), float(true)
+    seen = collected(placed_pot.calibration, placed_pot.seed)
+    return Verification.of(placed_pot.calibration, JOB, seen), float(true)
+
+
+def test_a_short_and_slow_rail_has_room_to_gain_its_speed(placed_pot: JobRecord) -> None:
+    rail = CONFIG.rail.model_copy(update={"travel": (0.0, 0.04), "max_speed": 0.01, "acceleration": 0.02})
+    checks = iter([None, None])
+
+    def until_swept() -> None:
+        if next(checks, "swept"):
+            raise RefusedError("swept")
+
+    with pytest.raises(RefusedError, match="swept"):
+        collected(placed_pot.calibration, placed_pot.seed, CONFIG.model_copy(update={"rail": rail}), until_swept)
 
 
 def test_a_verification_keeps_the_turn_for_jobs_and_takes_it_back_when_the_plate_was_knocked(

@@ -224,6 +224,14 @@ def test_it_goes_no_further_unseen_than_the_jobs_way_to_its_staging_pose(site: S
         far.require_line(Planar(-1.85, -0.6, 0.0))
 
 
+def test_a_way_that_lasts_minutes_is_looked_at_to_its_end(site: Site) -> None:
+    far = seen_at(site, Planar(-10.0, 0.0, 0.0))
+    with pytest.raises(RefusedError, match=r"8\.15 m on odometry alone .* allowed 1\.45 m"):
+        far.require_line(Planar(-1.85, 0.0, 0.0), share=0.01)
+    slow = seen_at(site, Planar(-3.05, 0.0, 0.0))
+    assert slow.require_line(Planar(-1.85, 0.0, 0.0), share=0.01).x == pytest.approx(-1.85, abs=1e-3)
+
+
 def test_the_distance_between_outlines_is_that_of_their_nearest_points() -> None:
     square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     for aside, expected in (((1.3, 0.4), 0.3), ((1.3, 1.4), 0.5), ((0.5, 0.5), 0.0)):

@@ -7,14 +7,17 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from cell.config.cell_config import StationObstacle
 from cell.config.job import BoardSection, load_job
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_matrix
+from cell.procedures.arm.moves import Pace
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.drive.driving import Planar
-from cell.procedures.drive.way import Whereabouts
+from cell.procedures.drive.way import Way, Whereabouts
 from drivers.errors import RefusedError
+from drivers.make import Pose
 from tests.unit.cell.procedures.drive.test_driving import LateVehicle, moved
 from tests.unit.cell.procedures.drive.test_way import CONFIG, JOB, VEHICLE_FROM_BASE, Site
 
@@ -155,6 +158,25 @@ def test_a_target_in_the_table_is_not_driven_to() -> None:
         site.run(JOB.model_copy(update={"approach": JOB.approach.model_copy(update={"target": target})}))
     assert moved(Planar.of(JOB.approach.staging.se3()), site.truth()) < 0.05
     assert site.cell.world.collisions.found == ()
+
+
+def test_a_way_is_checked_at_the_pace_at_which_it_is_driven() -> None:
+    """A slow vehicle comes later to its line: nearer to what stands beside it."""
+    stands = Pose(translation=("-1750 mm", "660 mm", "-500 mm"), rotation=("0 deg",) * 3)
+    fixture = StationObstacle(name="fixture", size=("200 mm",) * 3, place_from_centre=stands)
+    approach = JOB.approach.model_copy(update={"speed": 0.2})
+    job = JOB.model_copy(update={"approach": approach, "obstacle": (fixture,)})
+    site, pace, stood = Site(), Pace(), Planar(approach.start.translation[0], 0.45, 0.0)
+    model = site.cell.world.vehicle
+    model._x, model._y, model._yaw = stood.x, stood.y, stood.yaw
+    site.cell.clock.sleep(0.1)
+    site.whereabouts.enter(job)
+    site.whereabouts.see(stood)
+    Way(job, VEHICLE_FROM_BASE, site.whereabouts).require_line(Planar.of(approach.staging.se3()))
+    pace.share = 0.25
+    with pytest.raises(RefusedError, match="of the station obstacle fixture"):
+        site.run(job, pace=pace)
+    assert moved(stood, site.truth()) < 1e-6
 
 
 class TwoStations(Site):

@@ -68,6 +68,15 @@ def test_without_a_droop_nothing_is_added_and_too_large_a_one_is_refused(placed_
         inverted_of_droop(placed_pot, 0.4e-3)
 
 
+def test_a_rail_that_ends_at_its_zero_goes_to_its_other_end(placed_pot: JobRecord, station: Station) -> None:
+    made, work = placed_pot.results, station(folded=False).work
+    rail = work.config.rail.model_copy(update={"travel": (-0.1, 0.0)})
+    work.config = work.config.model_copy(update={"rail": rail})
+    scan = replace(made["reconstruct"], cloud=drooped(placed_pot, 0.15e-3))
+    (note,) = inverted(work, made["laser_sweep"], scan, made["board_photo"]).notes
+    assert "as if its carriage had sunk by 0.1" in note
+
+
 def test_a_place_that_is_carried_on_for_a_creep_keeps_what_the_droop_adds(
     placed_pot: JobRecord, station: Station
 ) -> None:

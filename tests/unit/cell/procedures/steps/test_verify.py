@@ -53,9 +53,10 @@ def require_seen(found: PlacedPart, off: pin.SE3) -> None:
     assert np.linalg.norm(error[:3]) < 0.025e-3 and np.abs(error[3:]).max() < 0.25e-3
     # Chi-squared of 6 at 0.999.
     assert error @ np.linalg.solve(found.covariance, error) < 22.5
-    assert found.unsure < 0.03e-3
+    # Most of it is where the laser points, which the plate on the claw shows to .1 mrad.
+    assert found.unsure < 0.045e-3
     true = np.linalg.norm(transform(off, found.points) - found.points, axis=1)
-    assert 1e3 * np.percentile(true, 95) < found.bound["d"] < 1e3 * np.percentile(true, 95) + 0.04
+    assert 1e3 * np.percentile(true, 95) < found.bound["d"] < 1e3 * np.percentile(true, 95) + 0.07
 
 
 def test_where_the_placed_part_lies_is_seen_beside_the_surface_to_hundredths(
@@ -303,6 +304,19 @@ def test_a_head_that_moved_after_the_sweep_is_neither_a_push_nor_a_part_that_lie
     site = lying_part(half=half, changed=lambda cell: happened(cell.world))
     with pytest.raises(MisplacedError, match=told):
         site.looked(moved())
+
+
+def test_a_laser_that_has_turned_since_the_calibration_leaves_open_no_more_than_one_that_has_not(
+    placed_pot: JobRecord, lying: tuple[PlacedPart, LyingPart], tmp_path: Path
+) -> None:
+    sweep = placed_pot.results["laser_sweep"]
+    pointing = replace(sweep.pointing, turn=-0.25e-3)
+    record = replace(placed_pot, results={**placed_pot.results, "laser_sweep": replace(sweep, pointing=pointing)})
+    found = LyingPart(record, tmp_path, changed=lambda cell: laser_turned(0.25)(cell.world)).looked(moved())
+    height, before = (np.sqrt(each.covariance[2, 2]) for each in (found, lying[0]))
+    assert height == pytest.approx(before, rel=0.2)
+    # The part is 20 mm nearer to the laser than the surface: of what turns both, that much is left between them.
+    assert 0.01e-3 < before < 0.02e-3
 
 
 def test_a_part_whose_upper_side_lies_elsewhere_than_drawn_is_not_moved_by_it(

@@ -12,8 +12,10 @@ from cell.measure.geometry.poses import difference
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance, invert_pose
 from cell.measure.inversion.effects.during_sweep import (
     LARGEST_RAD,
+    Head,
     Rocking,
     _Sweep,
+    find_droop,
     find_rocking,
     rocking_covariance,
     rocking_motions,
@@ -34,12 +36,14 @@ RATE, LINES, NOISE = 30.0, 128, 8e-6
 TIMES = np.arange(LINES) / RATE
 
 
-def scanned(roll: float, pitch: float, hz: float, seed: int = 0, times: np.ndarray = TIMES) -> Cloud:
+def scanned(
+    roll: float, pitch: float, hz: float, seed: int = 0, times: np.ndarray = TIMES, rows: int = 90
+) -> Cloud:  # fmt: skip
     """Lines across the pot, taken at `times`, each displaced as the base was turned then, with noise on top."""
-    rng = np.random.default_rng(seed)
+    rng, lines = np.random.default_rng(seed), len(times)
     low, high = NOMINAL.extent
-    along = np.linspace(0.93 * low[0], 0.93 * high[0], LINES)
-    across = np.linspace(0.9 * low[1], 0.9 * high[1], 90)
+    along = np.linspace(0.93 * low[0], 0.93 * high[0], lines)
+    across = np.linspace(0.9 * low[1], 0.9 * high[1], rows)
     x, y = np.meshgrid(along, across, indexing="ij")
     start = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, high[2] + 1e-3)])
     for _ in range(8):
@@ -47,15 +51,15 @@ def scanned(roll: float, pitch: float, hz: float, seed: int = 0, times: np.ndarr
         _, feet = NOMINAL.feet(start)
         start[:, 2] -= feet.heights / np.maximum(feet.normals[:, 2], 0.2)
     points = (start + np.array([0, 0, 1.0]) * NOISE * rng.standard_normal((len(start), 1))) @ SURFACE.rotation.T
-    points = (points + SURFACE.translation).reshape(LINES, 90, 3)
+    points = (points + SURFACE.translation).reshape(lines, rows, 3)
     wave = np.sin(2 * np.pi * hz * times + 0.7)
-    for k in range(LINES):
+    for k in range(lines):
         turn = pin.exp3(wave[k] * np.array([roll, pitch, 0.0]))
         points[k] = (points[k] - VEHICLE.translation) @ turn.T + VEHICLE.translation
     spread = np.broadcast_to(np.array([0.0, 0.0, NOISE], dtype=np.float32), points.shape)
-    flanges = np.tile(np.eye(4), (LINES, 1, 1))
-    return Cloud(points, spread, np.zeros((LINES, 3)), np.zeros((LINES, 90)), np.arange(LINES) * 5e-4,
-                 np.zeros((LINES, 90), dtype=bool), flanges)  # fmt: skip
+    flanges = np.tile(np.eye(4), (lines, 1, 1))
+    return Cloud(points, spread, np.zeros((lines, 3)), np.zeros((lines, rows)), np.arange(lines) * 5e-4,
+                 np.zeros((lines, rows), dtype=bool), flanges)  # fmt: skip
 
 
 def test_each_sweep_rocks_by_itself() -> None:
@@ -104,6 +108,22 @@ def test_rocking_is_seen_with_its_frequency_and_the_pose_is_freed_of_it(roll: fl
     # The surface reaches 30 mm from its middle.
     assert np.linalg.norm(after[:3]) + 0.03 * np.linalg.norm(after[3:]) < 15e-6
     assert np.linalg.norm(after) <= np.linalg.norm(before) + 5e-6
+
+
+def test_a_dense_scan_shows_what_its_lines_show() -> None:
+    """Of so many lines 10,000 points are fewer than 8 each."""
+    times = np.arange(1900) / 400.0
+    rocks = scanned(0.0, 1e-4, 3.3, times=times, rows=16)
+    found = find_rocking(rocks, NOMINAL, SURFACE, times)
+    assert found is not None and found.hz == pytest.approx(3.3, abs=0.1)
+    firm = replace(scanned(0.0, 0.0, 3.3, times=times, rows=16), rail=np.linspace(0.02, 0.08, len(times)))
+    up = SURFACE.rotation[:, 2]
+    down = pin.SE3(np.diag([1.0, -1.0, -1.0]), SURFACE.translation + 0.13 * up)
+    head = Head.of(firm, pin.SE3.Identity(), down, np.array([1.0, 0.0, 0.0]), 0.1)
+    assert find_droop(firm, NOMINAL, SURFACE, head) is None
+    sunk = 0.3e-3 * head.share[:, None, None] ** 2 * up
+    droop = find_droop(replace(firm, points=firm.points - sunk), NOMINAL, SURFACE, head)
+    assert droop is not None and droop.sag == pytest.approx(0.3e-3, rel=0.1)
 
 
 def test_a_vehicle_that_stands_is_not_said_to_rock() -> None:
