@@ -74,8 +74,11 @@ class CanLink:
         return self._failure is None and self._thread.is_alive()
 
     def check(self) -> None:
-        """Raise `NotConnectedError` after `close`, `DeviceFault` (vehicle.link_lost) when the bus has failed."""
-        if self._closing.is_set():
+        """Raise `NotConnectedError` after `close`, `DeviceFault` (vehicle.link_lost) when the bus has failed.
+
+        A bus that failed says so also once it was closed, so that one that cannot be opened again yet is tried later.
+        """
+        if self._closing.is_set() and self._failure is None:
             raise NotConnectedError(self._name, "the vehicle was closed. Open it again")
         if not self.alive:
             raise DeviceFault(
