@@ -125,7 +125,7 @@ class ArmSession:
         self.link = self._connect(lambda: True)
         try:
             self._require_model()
-        except Exception:
+        except BaseException:
             self.close()
             raise
 

@@ -90,15 +90,11 @@ class AgilexVehicle:
             statistics=self.statistics,
         )  # fmt: skip
         self._link = self._open()
-        if not self._wait_for(self._feedback.complete, FIRST_FEEDBACK_S):
+        try:
+            self._require_vehicle()
+        except BaseException:
             self._link.close()
-            missing, malformed = self._feedback.missing(), self.statistics.errors.get("malformed", 0)
-            heard = f" completely: {', '.join(missing)} did not come" if len(missing) < len(CYCLIC) else ""
-            if malformed:
-                heard += f"; {malformed} frames had another length than in the protocol"
-            raise NotConnectedError(
-                name, f"no vehicle reports on {self._address}{heard}. Check that it is on, and the bit rate"
-            )
+            raise
         self._keeper = threading.Thread(target=self._keep_alive, name=f"{name} keep-alive", daemon=True)
         self._keeper.start()
 
@@ -183,6 +179,16 @@ class AgilexVehicle:
         """As `enable`, but with the brake locked throughout: the vehicle stays where it was measured."""
         self._take_command()
         self.brake()
+
+    def _require_vehicle(self) -> None:
+        if not self._wait_for(self._feedback.complete, FIRST_FEEDBACK_S):
+            missing, malformed = self._feedback.missing(), self.statistics.errors.get("malformed", 0)
+            heard = f" completely: {', '.join(missing)} did not come" if len(missing) < len(CYCLIC) else ""
+            if malformed:
+                heard += f"; {malformed} frames had another length than in the protocol"
+            raise NotConnectedError(
+                self.name, f"no vehicle reports on {self._address}{heard}. Check that it is on, and the bit rate"
+            )
 
     def _take_command(self) -> None:
         if self._closed.is_set():

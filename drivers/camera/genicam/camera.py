@@ -19,7 +19,6 @@ from drivers.camera.genicam.device import GenicamDevice, Place, StampClock
 from drivers.camera.genicam.make import GenicamConfig, GigeCameraConfig
 from drivers.clock import Clock
 from drivers.errors import (
-    CellError,
     DeviceFault,
     InterlockError,
     LimitError,
@@ -142,7 +141,7 @@ class GenicamCamera:
         if not self._look:
             try:
                 self._stamps.compare(device)
-            except CellError:
+            except BaseException:
                 device.close()
                 raise
 
@@ -432,7 +431,7 @@ def connect(
                 _set_packets(device, record)
             if wish is not None:
                 set_timing(device, wish, paced=record.paced)
-    except CellError:
+    except BaseException:
         device.close()
         raise
     return device, found

@@ -1,5 +1,6 @@
 """The vehicle's driver with the simulated vehicle's own frames, on a bus inside this process: what must never fail."""
 
+import _thread
 import math
 import threading
 import time
@@ -291,6 +292,14 @@ def test_frames_of_another_length_are_not_read_and_are_told(bench: Bench) -> Non
     told = pytest.raises(NotConnectedError, match=r"Odometry did not come; \d+ frames had another length")
     with bench.sending(short), told:
         bench.connect()
+
+
+def test_an_interrupt_while_it_connects_leaves_no_bus_open(bench: Bench) -> None:
+    bench.bus.talking = False
+    threading.Timer(0.1, _thread.interrupt_main).start()
+    with pytest.raises(KeyboardInterrupt):
+        bench.connect()
+    assert [thread.name for thread in threading.enumerate()].count("vehicle receiver") == 1
 
 
 def test_a_person_at_the_remote_control_is_in_charge(bench: Bench) -> None:
