@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from drivers.camera.frame_queue import QUEUE_BYTES, FrameQueue, alone, capacity, check_fits
+from drivers.camera.frame_queue import QUEUE_BYTES, FrameQueue, alone, capacity, check_fits, frame_patience
 from drivers.camera.genicam.acquisition import FORMATS, AcquiredPicture, Acquisition
 from drivers.camera.genicam.aravis import AravisMissing, load
 from drivers.camera.genicam.device import GenicamDevice, Place, StampClock
@@ -214,6 +214,7 @@ class GenicamCamera:
     def _photograph(self, device: GenicamDevice, timeout: float, *, triggered: bool) -> Frame:
         with self._acquire(device, 4, whole=True) as frames:
             called = self._clock.now()
+            until = called + self._clock.rate * frame_patience(self._clock, timeout)
             if triggered:
                 device.call("software_trigger")
             while True:
@@ -223,6 +224,8 @@ class GenicamCamera:
                 if frame.host_time >= called - self._stamps.slack:
                     return frame
                 self.statistics.count("stale_frames")
+                if self._clock.now() > until:
+                    raise self._stamps.too_early(frame, called)
 
     def _frame(self, picture: AcquiredPicture, count: int) -> Frame:
         received = self._clock.now()
