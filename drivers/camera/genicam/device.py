@@ -273,7 +273,7 @@ class StampClock:
     @property
     def bound(self) -> float:
         """Largest error in s of a host time; unlimited while nothing has told of the camera's clock."""
-        return math.inf if self._map is None else self._map.uncertainty
+        return math.inf if self._map is None else self._map.bound_at(self._clock.now())
 
     @property
     def slack(self) -> float:
