@@ -100,7 +100,10 @@ class AgilexVehicle:
 
     def identity(self) -> Identity:
         """The protocol has no serial number; a version that is not told is "unknown"."""
-        for ask in (self._ask_text, self._ask_numbers):
+        for ask in (
+            partial(self._link.send_data, *TEXT_REQUEST),
+            partial(self._link.send, "VersionRequest", Request=1),
+        ):
             answer = self._feedback.ask_version()
             ask()
             if self._wait_for(answer.is_complete, REPLY_TIMEOUT_S):
@@ -294,13 +297,13 @@ class AgilexVehicle:
                 self._send_locks()
 
     def close(self) -> None:
-        """Stop the vehicle, end the threads and shut the bus down."""
+        """Stop the vehicle and lock its brake, end the threads and shut the bus down."""
         if self._closed.is_set():
             return
         try:
             # Whoever never commanded it has nothing to end, and another may be driving it.
             if self._took_command:
-                self.stop()
+                self.brake()
         finally:
             self._closed.set()
             self._keeper.join(2.0)
@@ -357,12 +360,6 @@ class AgilexVehicle:
         if self._velocity != (0.0, 0.0):
             self._feedback.commanded_to_move()
         self._link.send("MotionCommand", Speed=speed, YawRate=yaw_rate, LateralSpeed=0.0, Steering=0.0)
-
-    def _ask_text(self) -> None:
-        self._link.send_data(*TEXT_REQUEST)
-
-    def _ask_numbers(self) -> None:
-        self._link.send("VersionRequest", Request=1)
 
     def _wait_for(self, happened: Callable[[], bool], timeout: float) -> bool:
         return self._feedback.wait_for(happened, timeout, lambda: self._link.alive)

@@ -136,6 +136,8 @@ def test_the_last_velocity_is_not_kept_alive_by_whatever_ends_it(bench: Bench, e
     assert still <= 10, "what was on its way already; the driver's limit takes some 25"
     if end != "enable":
         assert abs(bench.speed()) < 0.02
+    if end == "close":
+        bench.until(bench.braked)
 
 
 def test_a_stop_that_nobody_confirms_is_told_bars_driving_meanwhile_and_the_brake_locks_all_the_same(
