@@ -42,7 +42,7 @@ class Clock:
 
     def wait(self, event: threading.Event, timeout: float) -> bool:
         """Wait for `event` for at most `timeout` seconds of this clock; True when it was set."""
-        return event.wait(max(0.0, timeout) / self.rate)
+        return event.wait(min(max(0.0, timeout) / self.rate, threading.TIMEOUT_MAX))
 
     def wall(self, seconds: float) -> float:
         """The seconds on the wall that `seconds` of this clock take, for time-outs of blocking system calls."""
@@ -72,6 +72,8 @@ class Clock:
 
 MAX_DRIFT = 100e-6
 """A crystal's drift that is expected before it has been measured."""
+STEADY_DRIFT = 5e-6
+"""By so much a crystal's rate changes as it warms up, however long it has been measured."""
 _KEEP = 64
 
 
@@ -122,7 +124,7 @@ class ClockMap:
         span = newest.device - oldest.device
         if span > 0.0 and (uncertainty := (newest.bound + oldest.bound) / span) < MAX_DRIFT:
             self._rate = (newest.host - oldest.host) / span
-            self._drift = uncertainty
+            self._drift = max(uncertainty, STEADY_DRIFT)
         self._best = min(self._latches, key=lambda latch: latch.bound + self._drift * (newest.host - latch.host))
         self._newest = newest
 

@@ -470,10 +470,10 @@ class VehicleState:
     """Vehicle feedback.
 
     Odometry is integrated by the driver from the wheel distances since it was opened: x, y in m and yaw in rad in the
-    frame where the vehicle stood then; `speed` m/s and `yaw_rate` rad/s as reported. `braked` is None as long as this
-    driver has not commanded the brake, and when somebody else may have released it since; `battery_volts` where nobody
-    tells it. `trouble` says in words what ends motion, `warnings` what does not. `interruptions` counts how often
-    odometry lost its connection to where the vehicle was before, and `interruption` says why it did last.
+    frame where the vehicle stood then; `speed` m/s and `yaw_rate` rad/s as reported. `braked` is None until this
+    driver has commanded the brake while it is in command, and when that may not hold any more; `battery_volts` where
+    nobody tells it. `trouble` says in words what ends motion, `warnings` what does not. `interruptions` counts how
+    often odometry lost its connection to where the vehicle was before, and `interruption` says why it did last.
     """
 
     stamp: float

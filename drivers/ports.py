@@ -9,6 +9,7 @@ from serial.urlhandler import protocol_socket
 
 from drivers.clock import Clock
 from drivers.errors import NotConnectedError
+from drivers.last_words import descriptor_of, log
 
 WRITE_TIMEOUT_S = 2.0
 """Wall seconds after which a port that takes no bytes counts as stuck."""
@@ -50,7 +51,7 @@ def open_port(
     """
     try:
         make = cast("type[serial.Serial]", SocketPort) if url.startswith("socket://") else serial.serial_for_url
-        return make(
+        port = make(
             url, baudrate=baud, timeout=timeout, write_timeout=WRITE_TIMEOUT_S, parity=PARITIES[parity],
             stopbits=stop_bits, exclusive=True,
         )  # fmt: skip
@@ -58,6 +59,9 @@ def open_port(
         raise NotConnectedError(
             name, f"port {url} cannot be opened: {error}. Check the address and that nothing else has it open"
         ) from error
+    if descriptor_of(port) is None:
+        log.warning("%s: nobody will stop it if this process is killed: port %s is no file of this computer", name, url)
+    return port
 
 
 def forget_unasked(link: socket.socket) -> None:

@@ -41,11 +41,15 @@ class Dashboard:
         if not self._lock.acquire(timeout=self._timeout):
             raise DeadlineError(self._name, f"the dashboard server was busy for {self._timeout:g} s")
         try:
+            if self._socket is not None:
+                try:
+                    forget_unasked(self._socket)
+                except OSError:  # The server was started again meanwhile; nothing was sent yet.
+                    self._drop()
             if self._socket is None:
                 self._connect(deadline)
             assert self._socket is not None
             self._rest = b""
-            forget_unasked(self._socket)
             self._socket.settimeout(_left(deadline))
             self._socket.sendall(command.encode() + b"\n")
             self._traffic.sent(command)

@@ -54,6 +54,8 @@ class ArmLimits:
 
     def check_payload(self, device: str, mass: float, centre: Vector) -> tuple[float, tuple[float, float, float]]:
         """Mass in kg and centre of gravity (3,) in m if the arm may carry it, else `LimitError`."""
+        if np.shape(centre) != (3,):
+            raise LimitError(device, f"a centre of gravity is 3 numbers in m, not {centre}; nothing was sent")
         mass = check_range(device, "payload", mass, low=0.0, high=self.payload, unit="kg")
         x, y, z = (check_range(device, "payload offset", float(v), low=-0.5, high=0.5, unit="m") for v in centre)
         return mass, (x, y, z)

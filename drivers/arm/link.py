@@ -79,22 +79,25 @@ class ArmLink:
         self._connect_deadline = connect_deadline
         self._reader = threading.Thread(target=self._read, name=f"{name} link", daemon=True)
         self._reader.start()
-        self._transmit(setup)
-        deadline = time.monotonic() + connect_deadline
-        while not up.done.wait(_LOOK_S) and wanted() and time.monotonic() < deadline:
-            pass
-        reason = f"no answer within {connect_deadline:g} s" if not up.done.is_set() else (up.problem or ("", ""))[1]
-        if reason or not wanted():
+        try:
+            self._transmit(setup)
+            deadline = time.monotonic() + connect_deadline
+            while not up.done.wait(_LOOK_S) and wanted() and time.monotonic() < deadline:
+                pass
+            if not wanted():
+                raise Aborted(f"{name}: connecting was stopped; the process that had begun it is gone")
+            reason = (up.problem or ("", ""))[1] if up.done.is_set() else f"no answer within {connect_deadline:g} s"
+            if reason:
+                raise NotConnectedError(
+                    name,
+                    f"no connection to the arm at {setup.address}: {reason}. See that it is switched on, that its "
+                    "address is right, that it is in remote control and that no other program controls it.",
+                )
+        except BaseException:  # also Ctrl-C: the child must not go on holding the arm
             self._closing = True
             self._process.kill()
             self._end()
-            if not wanted():
-                raise Aborted(f"{name}: connecting was stopped; the process that had begun it is gone")
-            raise NotConnectedError(
-                name,
-                f"no connection to the arm at {setup.address}: {reason}. See that it is switched on, that its address "
-                "is right, that it is in remote control and that no other program controls it.",
-            )
+            raise
         self._pulse = Pulse(f"{name} pulse", self._beat) if setup.control else None
 
     @property

@@ -1,6 +1,4 @@
-"""The arm driver's connection over its life: begun, lost, made safe, recovered, stopped as it recovers, closed.
-
-Making the arm safe without its child process: the program ended through the dashboard, the safe outputs off."""
+"""The arm driver's connection over its life: begun, lost, made safe, recovered, stopped as it recovers, closed."""
 
 import threading
 import time
@@ -125,7 +123,7 @@ class ArmSession:
         self.link = self._connect(lambda: True)
         try:
             self._require_model()
-        except Exception:
+        except BaseException:
             self.close()
             raise
 
@@ -145,10 +143,7 @@ class ArmSession:
     def require_remote(self) -> None:
         """Raise the `DeviceFault` of an arm in local control; one whose dashboard is silent is left to its link."""
         with suppress(DeadlineError, NotConnectedError):
-            try:
-                require_remote(self._name, self.dashboard)
-            except NotConnectedError:  # The server may have closed the connection meanwhile.
-                require_remote(self._name, self.dashboard)
+            require_remote(self._name, self.dashboard)
 
     def require_ready(self) -> None:
         """Raise the `DeviceFault` that keeps the arm from moving, if any."""

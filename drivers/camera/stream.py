@@ -83,7 +83,7 @@ class StreamCamera:
     @property
     def time_bound(self) -> float:
         """Largest error in s of a frame's host time: half the shortest latch, and the drift since."""
-        return self._map.uncertainty
+        return self._map.bound_at(self._clock.now())
 
     def ping(self) -> float:
         """One latch of the device's clock; returns the round trip in wall seconds."""

@@ -2,9 +2,7 @@
 
 Such a camera does not say when an exposure began. The kernel stamps a picture with the computer's own clock: at the
 start of the exposure, or as late as when its first bytes came, after the exposure and up to a frame later. Its times
-are known to half of that: enough for photographs and not for a sweep, which is then refused. Never run on a camera.
-
-What a picture of a V4L2 camera is worth: its pixels as grey, and what its time stamp leaves open."""
+are known to half of that: enough for photographs and not for a sweep, which is then refused. Never run on a camera."""
 
 import threading
 import time

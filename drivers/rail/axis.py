@@ -185,8 +185,8 @@ class RailAxis(ABC):
         """Raise unless positions mean something: `InterlockError` when it was never homed."""
 
     @abstractmethod
-    def _begin_homing(self, issued: int) -> None:
-        """Set the drive up and start its search for the reference switch."""
+    def _begin_homing(self, issued: int) -> float:
+        """Set the drive up and start its search for the reference switch; what that should take, s."""
 
     @abstractmethod
     def _home_found(self, issued: int) -> bool:
@@ -215,13 +215,13 @@ class RailAxis(ABC):
             self._homing = True
             try:
                 with self._halted_if_failed(issued):
-                    self._begin_homing(issued)
+                    duration = self._begin_homing(issued)
             except CellError:
                 self._homing = False
                 raise
             self._motion = RailMotion(
                 self.name, self._clock, arrived=self._searched(issued, length), halt=self._halt(issued),
-                duration=length / (0.5 * self._max_speed) + 0.1 * length / (0.1 * self._max_speed),
+                duration=duration,
             )  # fmt: skip
             return self._motion
 

@@ -1,9 +1,7 @@
 """A constant-velocity sweep and its position at any host time.
 
 The module's counter runs uniformly between the ramps, so a straight line through the samples of that stretch gives
-the position between them. A sample's time is only known within its round trip: see `drivers.rail.sweep`.
-
-What round trips tell of the time at which a rail in even motion was somewhere.
+the position between them. A sample's time is only known within its round trip.
 
 The counter held at some instant between request and reply, wherever in between. Readings of one even motion bound each
 other: a reading before and one after a place confine the time at which it was passed, so the shortest round trips tell

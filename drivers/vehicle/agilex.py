@@ -1,8 +1,9 @@
 """A skid-steered vehicle that speaks AgileX protocol v2 over CAN (docs/reference/protocols.md, section 3).
 
 The set velocity is kept alive by a thread of the driver, which falls back to zero when nobody renews it; the vehicle
-itself stops 0.5 s after the last command. Brake feedback is not on the bus: `braked` is what was commanded last, and
-None before this driver has commanded it, or when somebody else may have changed it since.
+itself stops 0.5 s after the last command. Brake feedback is not on the bus: `braked` is what was commanded last. It is
+None before this driver has commanded it, outside CAN mode, when an adapter has refused the command, or when somebody
+else may have changed it since.
 """
 
 import logging
@@ -25,6 +26,7 @@ from drivers.errors import (
 from drivers.interfaces import Identity, LinkStatistics, Reading, VehicleState
 from drivers.vehicle import health
 from drivers.vehicle.agilex_link import TEXT_REQUEST, UNKNOWN, AgilexLink, load_database
+from drivers.vehicle.can_link import REFUSED
 from drivers.vehicle.faults import OUT_OF_COMMAND
 from drivers.vehicle.feedback import CAN_MODE, CYCLIC, WANTED, MessageFeedback
 from drivers.vehicle.health import can_interface
@@ -36,6 +38,8 @@ STOP_TIMEOUT_S = 4.0
 ENABLE_TIMEOUT_S = 2.0
 REPLY_TIMEOUT_S = 0.5
 FIRST_FEEDBACK_S = 1.0
+LOCKS = 3
+"""So often the brake's lock is sent: an adapter may refuse a frame or two."""
 _ENABLE_RETRY_S = 0.3
 _KEEP_ALIVE_WALL_S = 0.005
 
@@ -69,8 +73,12 @@ class AgilexVehicle:
         self._renewed = -math.inf
         self._enabled = self._took_command = False
         self._braked: bool | None = None
-        self._interruptions = 0
-        """How many there had been when the brake was commanded: one more, and it may have been released since."""
+        self._interruptions: int | None = 0
+        """How many there had been when the brake was commanded: one more, and it may have been released since. None
+        outside CAN mode, where it may not have been obeyed."""
+        self._refused_before = 0
+        """How many frames had been refused when the lock was sent."""
+        self._lock_refused = False
         self._stopping = 0
         self._ends = 0
         self._alarms = 0
@@ -82,21 +90,20 @@ class AgilexVehicle:
             statistics=self.statistics,
         )  # fmt: skip
         self._link = self._open()
-        if not self._wait_for(self._feedback.complete, FIRST_FEEDBACK_S):
+        try:
+            self._require_vehicle()
+        except BaseException:
             self._link.close()
-            missing, malformed = self._feedback.missing(), self.statistics.errors.get("malformed", 0)
-            heard = f" completely: {', '.join(missing)} did not come" if len(missing) < len(CYCLIC) else ""
-            if malformed:
-                heard += f"; {malformed} frames had another length than in the protocol"
-            raise NotConnectedError(
-                name, f"no vehicle reports on {self._address}{heard}. Check that it is on, and the bit rate"
-            )
+            raise
         self._keeper = threading.Thread(target=self._keep_alive, name=f"{name} keep-alive", daemon=True)
         self._keeper.start()
 
     def identity(self) -> Identity:
         """The protocol has no serial number; a version that is not told is "unknown"."""
-        for ask in (self._ask_text, self._ask_numbers):
+        for ask in (
+            partial(self._link.send_data, *TEXT_REQUEST),
+            partial(self._link.send, "VersionRequest", Request=1),
+        ):
             answer = self._feedback.ask_version()
             ask()
             if self._wait_for(answer.is_complete, REPLY_TIMEOUT_S):
@@ -133,8 +140,9 @@ class AgilexVehicle:
         """The newest feedback, at most `max_age` s old (see `MessageFeedback.state`), else `DeadlineError`."""
         self._link.check()
         state = self._feedback.state(max_age, self._braked)
-        lost = self._enabled and not state.command_mode
-        return replace(state, braked=None) if lost or state.interruptions != self._interruptions else state
+        refused = self._braked and (self._lock_refused or self._refused() >= LOCKS)
+        sure = not refused and state.command_mode and state.interruptions == self._interruptions
+        return state if sure else replace(state, braked=None)
 
     def check(self) -> None:
         """Raise the `DeviceFault` that the vehicle shows now; see `MessageFeedback.check`. Returns at once otherwise.
@@ -174,6 +182,16 @@ class AgilexVehicle:
         """As `enable`, but with the brake locked throughout: the vehicle stays where it was measured."""
         self._take_command()
         self.brake()
+
+    def _require_vehicle(self) -> None:
+        if not self._wait_for(self._feedback.complete, FIRST_FEEDBACK_S):
+            missing, malformed = self._feedback.missing(), self.statistics.errors.get("malformed", 0)
+            heard = f" completely: {', '.join(missing)} did not come" if len(missing) < len(CYCLIC) else ""
+            if malformed:
+                heard += f"; {malformed} frames had another length than in the protocol"
+            raise NotConnectedError(
+                self.name, f"no vehicle reports on {self._address}{heard}. Check that it is on, and the bit rate"
+            )
 
     def _take_command(self) -> None:
         if self._closed.is_set():
@@ -273,18 +291,19 @@ class AgilexVehicle:
         finally:
             # No drive() between the standstill and the brake.
             with self._command:
-                self._braked, self._interruptions = True, self._feedback.interruptions
+                in_command = self._feedback.get("SystemState")[1]["Mode"] == CAN_MODE
+                self._braked, self._interruptions = True, self._feedback.interruptions if in_command else None
                 self._stopping -= 1
-            self._link.send("BrakeCommand", Locked=1)
+                self._send_locks()
 
     def close(self) -> None:
-        """Stop the vehicle, end the threads and shut the bus down."""
+        """Stop the vehicle and lock its brake, end the threads and shut the bus down."""
         if self._closed.is_set():
             return
         try:
             # Whoever never commanded it has nothing to end, and another may be driving it.
             if self._took_command:
-                self.stop()
+                self.brake()
         finally:
             self._closed.set()
             self._keeper.join(2.0)
@@ -303,6 +322,8 @@ class AgilexVehicle:
                             self._brake_against_others()
                         elif self._enabled:
                             self._send_velocity()
+                            if self._braked:
+                                self._repeat_refused_locks()
                     except CellError:
                         self.statistics.count("keep_alive_failed")
 
@@ -314,8 +335,24 @@ class AgilexVehicle:
         self._velocity, self._braked = (0.0, 0.0), True
         self._alarms = self._feedback.alarms
         self._send_velocity()
-        self._link.send("BrakeCommand", Locked=1)
+        self._send_locks()
         self.statistics.count("braked_against_others")
+
+    def _repeat_refused_locks(self) -> None:
+        """Send the lock again if one may have been refused, holding `_command`; see what became of those before."""
+        refused = self._refused()
+        self._lock_refused = refused >= LOCKS
+        if refused:
+            self._send_locks()
+
+    def _send_locks(self) -> None:
+        self._refused_before = self.statistics.errors.get(REFUSED, 0)
+        for _ in range(LOCKS):
+            self._link.send("BrakeCommand", Locked=1)
+
+    def _refused(self) -> int:
+        """Frames that were refused since the lock was sent: fewer than `LOCKS`, and at least one lock was taken."""
+        return self.statistics.errors.get(REFUSED, 0) - self._refused_before
 
     def _send_velocity(self) -> None:
         """Send the set velocity, holding `_command`: else an older velocity could follow the zero of a stop."""
@@ -323,12 +360,6 @@ class AgilexVehicle:
         if self._velocity != (0.0, 0.0):
             self._feedback.commanded_to_move()
         self._link.send("MotionCommand", Speed=speed, YawRate=yaw_rate, LateralSpeed=0.0, Steering=0.0)
-
-    def _ask_text(self) -> None:
-        self._link.send_data(*TEXT_REQUEST)
-
-    def _ask_numbers(self) -> None:
-        self._link.send("VersionRequest", Request=1)
 
     def _wait_for(self, happened: Callable[[], bool], timeout: float) -> bool:
         return self._feedback.wait_for(happened, timeout, lambda: self._link.alive)

@@ -1,9 +1,8 @@
 """AgileX protocol v2 on a CAN bus: messages by their names in the DBC, in its units.
 
-What the vehicle answers when it is asked for its version; descriptions of the protocol differ in how that goes.
-
-The maker's SDK sends 01 to 0x4A1 and reads ten frames of text there. The SCOUT manual 1.3.0 asks at 0x411 and reads
-four numbers at 0x41A. Some firmware answers neither: then the version is unknown, which is no fault."""
+Descriptions of the protocol differ in how a vehicle is asked for its version. The maker's SDK sends 01 to 0x4A1 and
+reads ten frames of text there. The SCOUT manual 1.3.0 asks at 0x411 and reads four numbers at 0x41A. Some firmware
+answers neither: then the version is unknown, which is no fault."""
 
 import struct
 from collections.abc import Callable, Mapping

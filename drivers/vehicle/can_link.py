@@ -26,6 +26,8 @@ RECEIVE_TIMEOUT_S = 0.1
 SEND_TIMEOUT_S = 0.5
 MOST_REFUSED = 5
 """So many frames in a row may an adapter refuse: after it is opened it may refuse a command or two."""
+REFUSED = "refused"
+"""Counts the frames that an adapter has refused, where it says so."""
 _BELL, _TAKEN = "\a", ("\r", "z\r", "Z\r")
 """How an slcan adapter answers what it refuses, and a frame that it has taken."""
 
@@ -72,8 +74,11 @@ class CanLink:
         return self._failure is None and self._thread.is_alive()
 
     def check(self) -> None:
-        """Raise `NotConnectedError` after `close`, `DeviceFault` (vehicle.link_lost) when the bus has failed."""
-        if self._closing.is_set():
+        """Raise `NotConnectedError` after `close`, `DeviceFault` (vehicle.link_lost) when the bus has failed.
+
+        A bus that failed says so also once it was closed, so that one that cannot be opened again yet is tried later.
+        """
+        if self._closing.is_set() and self._failure is None:
             raise NotConnectedError(self._name, "the vehicle was closed. Open it again")
         if not self.alive:
             raise DeviceFault(
@@ -163,6 +168,7 @@ class CanLink:
             said: str | None = read(timeout)
             if said == _BELL:
                 self._refused += 1
+                self._statistics.count(REFUSED)
             elif said in _TAKEN:
                 self._refused = 0
             return said

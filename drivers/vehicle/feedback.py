@@ -1,8 +1,5 @@
-"""What the vehicle has reported last: waiting for news, its age, and the faults that it shows.
-
-Planar odometry of a skid-steered vehicle from the distances of its two sides.
-
-How far the wheels have turned: odometry, when it no longer tells where the vehicle is, and who else moved it."""
+"""What the vehicle has reported last, its age, and the faults that it shows; odometry from the distances of its two
+sides, and when that no longer tells where the vehicle is."""
 
 import math
 import threading

@@ -32,12 +32,12 @@ class VehicleContract(DeviceContract):
         return state.x, state.y
 
     def test_who_is_not_enabled_or_is_braked_is_not_driven(self, bench: Bench[Vehicle]) -> None:
-        """`InterlockError`, and it stands; `brake` twice is as once."""
+        """`InterlockError`, and it stands; the brake counts as locked once the vehicle is in command."""
         vehicle, here = bench.device, self.here(bench)
-        vehicle.brake()
-        vehicle.brake()
-        with pytest.raises(InterlockError):
-            vehicle.drive(DRIVE_SPEED, 0.0)
+        for hold in (vehicle.brake, vehicle.recover):
+            hold()
+            with pytest.raises(InterlockError):
+                vehicle.drive(DRIVE_SPEED, 0.0)
         state = vehicle.state(1.0)
         assert state.braked
         assert state.speed == 0.0

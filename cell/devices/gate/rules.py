@@ -57,10 +57,9 @@ def _parked(now: Situation, command: DeviceCommand) -> str | None:
     state = _newest(now, now.vehicle)
     if not (abs(state.speed) <= STILL and abs(state.yaw_rate) <= STILL):
         return f"the vehicle drives at {state.speed:.3f} m/s, {state.yaw_rate:.3f} rad/s. Call vehicle.brake() first"
-    if not state.braked:
-        brake = "open" if state.braked is False else "not known to be locked"
-        return f"the vehicle's brake is {brake}. Call vehicle.brake() first"
-    return None
+    if state.braked is None:
+        return "the vehicle's brake is not known to be locked. Call vehicle.recover() first"
+    return None if state.braked else "the vehicle's brake is open. Call vehicle.brake() first"
 
 
 def _newest(now: Situation, vehicle: Vehicle) -> VehicleState:

@@ -37,13 +37,12 @@ from cell.run.recorded_work import WorkContext
 from cell.run.resumption import UnfinishedRun
 from cell.run.runs import Run, Runs
 from cell.run.session.session import OpenCell, SessionRequest
-from drivers.errors import CalibrationStale, ConfigError
+from drivers.errors import CalibrationStale, ConfigError, DeviceFault
 from statemachine.runner import NO_SCRIPT, Event, Script
 from statemachine.watch import EndSignals, SignalInterrupt, SignalWatch
 
 HOMED = {"rail": ("rail",), "arm": ("arm", "vehicle")}
-"""The devices that `home` can bring home one at a time, and which have to be connected for each: the arm moves only
-while the vehicle is braked."""
+"""What `home` brings home by itself, and the devices that it needs: the arm moves only beside a braked vehicle."""
 
 Made = TypeVar("Made")
 _OnStored = Callable[[OpenCell, Run[object], CellCalibration, Job], Made]
@@ -386,9 +385,8 @@ class Cell:
             from cell.devices.simulated.described import Described
 
             self.simulated.make_ready(Described.of(job))
-        stored: CellCalibration | CalibrationStale
         try:
-            stored = self.calibration()
+            stored: CellCalibration | CalibrationStale = self.calibration()
         except CalibrationStale as error:
             # A simulated cell is calibrated by itself, but never over what a person has edited.
             if isinstance(error, CalibrationEdited) or not is_whole(self.simulated):
@@ -477,7 +475,9 @@ class Cell:
             arm, vehicle = self.devices.arm, self.devices.vehicle
             if not arm_is_ready(arm):
                 arm.recover(confirmed=True)
-            if vehicle.state().trouble:
+            try:
+                vehicle.check()
+            except DeviceFault:
                 vehicle.recover()
 
         self.perform("recovery", work, observer, {"by": by})

@@ -3,10 +3,8 @@
 A stream lives as long as the acquisition, so no picture of an earlier one can be taken for a new one. A picture of
 which packets are missing is dropped and counted; the gap in the block ids tells of it.
 
-From the pixels that a camera sends to 8-bit grey.
-
-Formats and their numbers are those of the Pixel Format Naming Convention (EMVA, 2.1); the two packings of GigE Vision
-("Packed") differ from the convention's own ("p"). What has more than 8 bits keeps its highest 8."""
+Pixels become 8-bit grey. Formats and their numbers are those of the Pixel Format Naming Convention (EMVA, 2.1); the two
+packings of GigE Vision ("Packed") differ from the convention's own ("p"). Of more than 8 bits the highest 8 count."""
 
 import ctypes
 import threading

@@ -12,14 +12,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from drivers.camera.frame_queue import QUEUE_BYTES, FrameQueue, alone, capacity, check_fits
+from drivers.camera.frame_queue import QUEUE_BYTES, FrameQueue, alone, capacity, check_fits, frame_patience
 from drivers.camera.genicam.acquisition import FORMATS, AcquiredPicture, Acquisition
 from drivers.camera.genicam.aravis import AravisMissing, load
 from drivers.camera.genicam.device import GenicamDevice, Place, StampClock
 from drivers.camera.genicam.make import GenicamConfig, GigeCameraConfig
 from drivers.clock import Clock
 from drivers.errors import (
-    CellError,
     DeviceFault,
     InterlockError,
     LimitError,
@@ -142,7 +141,7 @@ class GenicamCamera:
         if not self._look:
             try:
                 self._stamps.compare(device)
-            except CellError:
+            except BaseException:
                 device.close()
                 raise
 
@@ -215,6 +214,7 @@ class GenicamCamera:
     def _photograph(self, device: GenicamDevice, timeout: float, *, triggered: bool) -> Frame:
         with self._acquire(device, 4, whole=True) as frames:
             called = self._clock.now()
+            until = called + self._clock.rate * frame_patience(self._clock, timeout)
             if triggered:
                 device.call("software_trigger")
             while True:
@@ -224,6 +224,8 @@ class GenicamCamera:
                 if frame.host_time >= called - self._stamps.slack:
                     return frame
                 self.statistics.count("stale_frames")
+                if self._clock.now() > until:
+                    raise self._stamps.too_early(frame, called)
 
     def _frame(self, picture: AcquiredPicture, count: int) -> Frame:
         received = self._clock.now()
@@ -432,7 +434,7 @@ def connect(
                 _set_packets(device, record)
             if wish is not None:
                 set_timing(device, wish, paced=record.paced)
-    except CellError:
+    except BaseException:
         device.close()
         raise
     return device, found

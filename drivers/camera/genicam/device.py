@@ -273,7 +273,7 @@ class StampClock:
     @property
     def bound(self) -> float:
         """Largest error in s of a host time; unlimited while nothing has told of the camera's clock."""
-        return math.inf if self._map is None else self._map.uncertainty
+        return math.inf if self._map is None else self._map.bound_at(self._clock.now())
 
     @property
     def slack(self) -> float:
@@ -293,15 +293,18 @@ class StampClock:
     def judged(self, frame: Frame, called: float) -> Frame:
         """The frame of a trigger that was sent at `called`, s; `DeviceFault` (camera.clock) when its stamp is none."""
         last = frame.received - frame.exposure
-        early = called - frame.host_time
-        if self._map is not None and early > self.slack:
-            raise self._wrong("before it was triggered", early, self.slack)
+        if self._map is not None and called - frame.host_time > self.slack:
+            raise self.too_early(frame, called)
         if (wrong := self.impossible(frame)) is not None:
             raise wrong
         if self._latched or not frame.device_time or last <= called:
             return frame
         self._add([Latch(called, frame.device_time, last)])
         return replace(frame, host_time=self.host_time(frame.device_time, latest=last))
+
+    def too_early(self, frame: Frame, called: float) -> DeviceFault:
+        """The fault (camera.clock) of a picture whose exposure began before it was asked for at `called`, s."""
+        return self._wrong("before it was asked for", called - frame.host_time, self.slack)
 
     def impossible(self, frame: Frame) -> DeviceFault | None:
         """The fault (camera.clock) of a picture that was here before its exposure can have ended, as its stamp says."""

@@ -46,7 +46,7 @@ class ModbusDrive:
     def set(self, number: NumberConfig, value: int, issued: int | None = None) -> None:
         """Write a number and read it back; `DeviceFault` (rail.setting) when the drive has another."""
         try:
-            words = self._ordered(number.encode(value))
+            words = self._ordered(number.encode(value, signed=number is self.registers.target))
         except ValueError as error:
             raise LimitError(
                 self.name,

@@ -37,11 +37,11 @@ class NumberConfig(Table):
     words: Annotated[int, whole(1, 2, meaning=" registers of 16 bits")] = 2
     input: bool = False
 
-    def encode(self, value: int) -> list[int]:
+    def encode(self, value: int, *, signed: bool = False) -> list[int]:
         """The registers, high word first, negative numbers as two's complement; `ValueError` when it does not fit."""
         bits = 16 * self.words
-        if not -(1 << bits - 1) <= value < 1 << bits:
-            raise ValueError(f"{value} does not fit into {bits} bits")
+        if not -(1 << bits - 1) <= value < 1 << bits - signed:
+            raise ValueError(f"{value} does not fit into {bits} bits{' with a sign' if signed else ''}")
         value &= (1 << bits) - 1
         return [value & 0xFFFF] if self.words == 1 else [value >> 16, value & 0xFFFF]
 

@@ -16,6 +16,8 @@ from drivers.rail.modbus.make import ModbusRailConfig, NumberConfig
 ROUNDING = 0.01
 """By what share a speed may be rounded to the drive's unit; an acceleration by five times that."""
 _VELOCITY_S = 0.02
+_SEARCH_S = 300.0
+"""A drive searches at a speed of its own, which is not known here: sooner only its readings end the search."""
 
 
 class ModbusRail(RailAxis):
@@ -119,9 +121,10 @@ class ModbusRail(RailAxis):
     def _require_zero(self) -> None:
         self._zero.require()
 
-    def _begin_homing(self, issued: int) -> None:
+    def _begin_homing(self, issued: int) -> float:
         self._set_up()
         self._zero.search(issued=issued)
+        return _SEARCH_S
 
     def _home_found(self, issued: int) -> bool:
         found = self._zero.found()

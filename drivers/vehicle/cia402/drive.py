@@ -1,8 +1,4 @@
-"""What one wheel drive has told last.
-
-The state machine of a CiA 402 drive: what a statusword says, and which controlword leads on.
-
-What a drive's emergency code means, in words with a remedy.
+"""What one wheel drive has told last: its state by its statusword, its emergency code in words with a remedy.
 
 Source: the error code ranges of CiA 301 and the codes that CiA 402 adds. A code that is not here is told by its range.
 

@@ -1,6 +1,5 @@
-"""What both drives tell together: the vehicle's state, and the faults that it shows.
-
-How a vehicle of two wheel drives is built: from its metres a second to its drives' numbers, and back.
+"""What both drives tell together: the vehicle's state, the faults that it shows, and its metres a second in numbers of
+the drives.
 
 Whether a wheel's speed and its counts tell of the same way: a unit may be wrong, in cell.toml or in the drive."""
 

@@ -3,9 +3,7 @@
 A thread sends SYNC and signs of life and, while the vehicle may be driven, both target velocities. One wheel alone
 never drives: when one drive gives up, both are stopped with the quick stop.
 
-Asking both drives by SDO for what they otherwise tell in PDOs: nothing on them has to be set for that.
-
-What is sent to the drives when this process is killed: both quick stops, then the brakes' outputs."""
+When this process is killed, both quick stops are sent, then the brakes' outputs."""
 
 import logging
 import math

@@ -2,8 +2,7 @@
 hardware.
 
 When this program is gone, the drives stop by their own watchdog. That they do is tried at speed 0, once per connection.
-
-How the drives' CAN bus is used, who else commands there, and what the drives tell of their supply."""
+"""
 
 import threading
 from collections.abc import Sequence

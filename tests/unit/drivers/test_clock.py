@@ -1,8 +1,11 @@
 """A device's clock on the host's, where that clock was set while nobody looked."""
 
+import math
+import threading
+
 import pytest
 
-from drivers.clock import MAX_DRIFT, ClockMap, Latch
+from drivers.clock import MAX_DRIFT, Clock, ClockMap, Latch
 
 
 def latch(host: float, ahead: float, half: float) -> Latch:
@@ -50,8 +53,26 @@ def test_the_bound_holds_a_clock_that_drifts_before_and_after_its_latches() -> N
     assert clocks.bound_at(200.0) > clocks.bound_at(20.0) > clocks.bound_at(10.0)
 
 
+def test_a_wait_without_end_ends_with_the_event() -> None:
+    over = threading.Event()
+    threading.Timer(0.02, over.set).start()
+    assert Clock().wait(over, math.inf)
+
+
 def test_a_drift_that_is_known_carries_far() -> None:
     clocks = ClockMap()
     for host in (0.0, 1000.0):
         clocks.add([latch(host, 5.0, 50e-6)])
     assert clocks.host_time(latch(2000.0, 5.0, 0.0).device) == pytest.approx(2000.0, abs=0.5e-3)
+
+
+def test_the_bound_holds_for_a_crystal_that_warms_up() -> None:
+    """By 10 ppm within 10 min, latched each half minute, mostly with a longer round trip; also 20 s after a latch."""
+    clocks = ClockMap()
+    for host in range(0, 3600, 30):
+        half = 300e-6 if host % 300 else 50e-6
+        for at in (host, host + 20.0):
+            device = at + 10e-6 * (at - 600.0 * (1.0 - math.exp(-at / 600.0)))
+            if at == host:
+                clocks.add([Latch(at - half, device, at + half)])
+            assert abs(clocks.host_time(device) - at) <= clocks.bound_at(at) <= 2.2e-3

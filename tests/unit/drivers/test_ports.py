@@ -25,3 +25,8 @@ def test_a_port_over_a_network_closes_at_once_and_is_opened_again_when_its_serve
         again.close()
         with pytest.raises(OSError, match="not open"):
             again.read(1)
+
+
+def test_a_port_that_no_helper_can_hold_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    open_port("laser", "loop://", baud=9600, timeout=0.1).close()
+    assert "laser: nobody will stop it if this process is killed: port loop://" in caplog.text

@@ -28,13 +28,17 @@ def dashboard():
         asked = []
 
         def serve():
-            client, _ = listener.accept()
-            with client:
-                client.sendall(b"Connected\n")
-                for question in client.makefile("r"):
-                    asked.append(question.strip())
-                    if (told := answer(asked[-1])) is not None:
-                        client.sendall(f"{told}\n".encode())
+            with suppress(OSError):
+                while True:
+                    client, _ = listener.accept()
+                    with client, client.makefile("r") as questions:
+                        client.sendall(b"Connected\n")
+                        for question in questions:
+                            asked.append(question.strip())
+                            if (told := answer(asked[-1])) is not None:
+                                client.sendall(f"{told}\n".encode())
+                            if asked[-1] == "quit":
+                                break
 
         threading.Thread(target=serve, daemon=True).start()
         return Dashboard("arm", listener.getsockname()[0], timeout=timeout), asked

@@ -18,6 +18,15 @@ def test_the_dashboard_answers_line_by_line_over_one_connection(dashboard):
     board.close()
 
 
+def test_a_server_that_was_started_again_is_connected_anew_and_nothing_is_sent_twice(dashboard):
+    board, asked = dashboard(lambda question: f"you said {question}")
+    assert board.ask("quit") == "you said quit"
+    time.sleep(0.05)
+    assert board.ask("stop") == "you said stop"
+    assert asked == ["quit", "stop"]
+    board.close()
+
+
 def test_a_silent_dashboard_is_a_deadline_and_a_missing_one_is_not_connected(dashboard):
     board, _ = dashboard(lambda question: None, timeout=0.05)
     with pytest.raises(DeadlineError, match=r"did not answer 'stop' within 0\.05 s"):

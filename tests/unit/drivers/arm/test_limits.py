@@ -56,6 +56,8 @@ def test_speeds_and_accelerations_have_limits_and_those_of_straight_moves_their_
 def test_a_payload_too_heavy_is_refused():
     with pytest.raises(LimitError, match=r"payload 13 kg is outside 0 kg to 12\.5 kg"):
         LIMITS.check_payload("arm", 13.0, np.zeros(3))
+    with pytest.raises(LimitError, match="3 numbers in m, not"):
+        LIMITS.check_payload("arm", 1.0, np.zeros(2))
 
 
 @pytest.mark.parametrize("axis", range(3))

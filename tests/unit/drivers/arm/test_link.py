@@ -4,6 +4,7 @@ import os
 import signal
 import socket
 import struct
+import threading
 import time
 from contextlib import closing, contextmanager
 from itertools import islice
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from drivers.arm import link
+from drivers.arm.feed import ChildSetup
 from drivers.arm.link import RtdeLink, latch_clock
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
@@ -39,6 +41,16 @@ def test_a_packet_that_stops_in_its_middle_keeps_nobody_waiting(monkeypatch):
             arm.close()
             with pytest.raises(ConnectionResetError, match="closed the connection"):
                 made.wait(1.0)
+
+
+def test_an_interrupt_while_it_connects_leaves_no_child():
+    def interrupted():
+        raise KeyboardInterrupt
+
+    setup = ChildSetup("127.255.0.9", 1.0, (), (0.0, (0.0, 0.0, 0.0)), watchdog=0.2, braking=4.0)
+    with pytest.raises(KeyboardInterrupt):
+        link.ArmLink("arm", setup, 5.0, print, print, print, wanted=interrupted)
+    assert "arm link" not in [thread.name for thread in threading.enumerate()]
 
 
 @pytest.mark.parametrize("way", [signal.SIGKILL, signal.SIGSEGV])

@@ -1,5 +1,6 @@
 """The vehicle's driver with the simulated vehicle's own frames, on a bus inside this process: what must never fail."""
 
+import _thread
 import math
 import threading
 import time
@@ -19,7 +20,7 @@ from drivers.vehicle.agilex import DEAD_MAN_S, AgilexVehicle
 from drivers.vehicle.agilex_link import load_database
 from drivers.vehicle.feedback import QUIET_S
 from sim_backends.clock import WorldClock
-from sim_backends.models.vehicle import VehicleModel, VehicleParams
+from sim_backends.models.vehicle import Mode, VehicleModel, VehicleParams
 from sim_backends.peers.vehicle.agilex import AgilexPeer
 from sim_backends.peers.vehicle.slcan import CanFrame
 from tests.support.inner_bus import Driven, on_inner_bus
@@ -86,6 +87,24 @@ def test_the_brake_locks_in_truth_and_then_nothing_drives(bench: Bench) -> None:
     assert set(sent) == {bytes(8)}
 
 
+def test_a_brake_outside_can_mode_is_not_taken_as_locked(bench: Bench) -> None:
+    """Under the remote control, say, that has taken over from this program and has handed back."""
+    vehicle, model = bench.vehicle, bench.peer.model
+    vehicle.brake()
+    assert vehicle.state().braked is True
+    model.set_mode(bench.world.now(), Mode.STANDBY)
+    bench.until(lambda: not vehicle.state().command_mode)
+    assert vehicle.state().braked is None
+    with pytest.raises(DeviceFault, match="left CAN command"):
+        vehicle.check()
+    vehicle.brake()
+    model.set_mode(bench.world.now(), Mode.CAN)
+    bench.until(lambda: vehicle.state().command_mode)
+    assert vehicle.state().braked is None
+    vehicle.recover()
+    assert vehicle.state().braked is True
+
+
 def test_a_velocity_that_nobody_renews_becomes_zero(bench: Bench) -> None:
     bench.drive_until_fast()
     bench.clock.sleep(DEAD_MAN_S + 0.6)
@@ -117,6 +136,8 @@ def test_the_last_velocity_is_not_kept_alive_by_whatever_ends_it(bench: Bench, e
     assert still <= 10, "what was on its way already; the driver's limit takes some 25"
     if end != "enable":
         assert abs(bench.speed()) < 0.02
+    if end == "close":
+        bench.until(bench.braked)
 
 
 def test_a_stop_that_nobody_confirms_is_told_bars_driving_meanwhile_and_the_brake_locks_all_the_same(
@@ -273,6 +294,14 @@ def test_frames_of_another_length_are_not_read_and_are_told(bench: Bench) -> Non
     told = pytest.raises(NotConnectedError, match=r"Odometry did not come; \d+ frames had another length")
     with bench.sending(short), told:
         bench.connect()
+
+
+def test_an_interrupt_while_it_connects_leaves_no_bus_open(bench: Bench) -> None:
+    bench.bus.talking = False
+    threading.Timer(0.1, _thread.interrupt_main).start()
+    with pytest.raises(KeyboardInterrupt):
+        bench.connect()
+    assert [thread.name for thread in threading.enumerate()].count("vehicle receiver") == 1
 
 
 def test_a_person_at_the_remote_control_is_in_charge(bench: Bench) -> None:

@@ -1,12 +1,14 @@
 """Promises of `drivers.vehicle.can_link`."""
 
+from typing import Any
+
 import can
 import numpy as np
 import pytest
 
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceFault, NotConnectedError
-from drivers.vehicle.agilex import AgilexVehicle
+from drivers.vehicle.agilex import LOCKS, AgilexVehicle
 from tests.support.wire.vehicle_bench import TRACK, Bench, benched, threads
 
 pytestmark = pytest.mark.wire
@@ -35,6 +37,24 @@ def test_a_dead_bus_is_a_fault_and_enabling_opens_it_again(enabled: Bench) -> No
     assert enabled.vehicle.statistics.errors["reopened"] == 1
 
 
+def test_a_bus_that_cannot_be_opened_yet_is_opened_by_the_next_recovery(
+    enabled: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unplugged(**settings: object) -> can.BusABC:
+        raise can.CanInitializationError("no such adapter")
+
+    enabled.peer.fault("can.bus_off")
+    enabled.until(lambda: not enabled.vehicle._link.alive)
+    with monkeypatch.context() as patch:
+        patch.setattr(can, "Bus", unplugged)
+        with pytest.raises(NotConnectedError, match="no such adapter"):
+            enabled.vehicle.recover()
+        with pytest.raises(DeviceFault, match="cell recover"):
+            enabled.vehicle.check()
+    enabled.vehicle.recover()
+    assert enabled.vehicle.state().braked
+
+
 def test_an_adapter_that_refuses_every_frame_is_a_fault_within_half_a_second() -> None:
     with benched(1.0) as made:
         made.vehicle.enable()
@@ -48,6 +68,32 @@ def test_an_adapter_that_refuses_every_frame_is_a_fault_within_half_a_second() -
         made.peer.clear()
         made.vehicle.enable()
         made.drive_for(0.3, 0.2)
+
+
+@pytest.mark.parametrize("refused", [LOCKS - 1, 1000])
+def test_a_lock_that_the_adapter_refuses_is_not_taken_as_locked_and_sent_again(refused: int) -> None:
+    left = refused
+    with benched(1.0) as made:
+        take, state = made.peer._bus._command, made.vehicle.state
+
+        def some(adapter: Any, line: bytes) -> None:
+            nonlocal left
+            if line.startswith(b"t131101") and left > 0:
+                left -= 1
+                adapter.put(b"\a")
+            else:
+                take(adapter, line)
+
+        made.vehicle.enable()
+        made.peer._bus._command = some  # type: ignore[method-assign]
+        made.vehicle.brake()
+        if refused > LOCKS:
+            made.until(lambda: state().braked is None)
+            made.clock.sleep(0.1)
+            assert {state().braked for _ in range(1000)} == {None}
+            left = 0
+        made.until(lambda: made.model.feedback(made.world.now()).braked)
+        made.until(lambda: state().braked is True)
 
 
 def test_commands_come_every_20_ms_and_closing_ends_them() -> None:

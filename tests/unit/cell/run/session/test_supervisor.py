@@ -19,6 +19,7 @@ from cell.run.session.session import OpenCell
 from cell.run.session.supervisor import Cell
 from drivers.errors import Aborted, ConfigError, InterlockError
 from tests.unit.cell.devices.gate.test_interlocks import CONFIG, LASER, at_rest, refused
+from tests.unit.drivers.vehicle.test_agilex import Bench
 
 
 @pytest.fixture
@@ -99,6 +100,18 @@ def test_work_outside_a_job_takes_the_vehicle_in_command_with_its_brake_locked(c
     cell.home("arm")
     state = cell.devices.vehicle.state()
     assert (state.command_mode, state.braked) == (True, True)
+
+
+def test_a_recovery_opens_the_vehicles_bus_again(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench("recovery")
+    try:
+        monkeypatch.setattr(cell.devices, "_vehicle", bench.vehicle)
+        bench.vehicle._link._fail("the cable was out")
+        cell.recover("Anna")
+        assert bench.vehicle.state().braked
+    finally:
+        bench.vehicle.close()
+        bench.peer.stop()
 
 
 def test_maintenance_lifts_what_it_names_and_nothing_else_and_is_recorded(

@@ -64,3 +64,16 @@ def test_a_photograph_can_come_from_a_free_run(bench: Bench) -> None:
     called = bench.clock.now()
     assert bench.shown(camera.grab()) > called
     camera.close()
+
+
+def test_a_free_run_whose_stamps_lie_before_every_question_ends_in_time(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = bench.open(trigger="free")
+    camera.configure(0.004, 20.0)
+    behind = camera._stamps.host_time
+    monkeypatch.setattr(camera._stamps, "host_time", lambda stamp, latest: behind(stamp, latest=latest) - 5.0)
+    with pytest.raises(DeviceFault, match="before it was asked for") as caught:
+        camera.grab(timeout=0.2)
+    assert caught.value.code == "camera.clock"
+    camera.close()

@@ -15,7 +15,7 @@ def test_stamps_that_are_none_of_the_exposure_are_refused() -> None:
     with served(replace(SPEC, latency=-0.2)) as bench:
         camera = bench.open()
         camera.configure(0.004, 50.0)
-        with pytest.raises(DeviceFault, match="before it was triggered") as caught:
+        with pytest.raises(DeviceFault, match="before it was asked for") as caught:
             camera.grab()
         camera.close()
     assert caught.value.code == "camera.clock"

@@ -51,6 +51,13 @@ def test_a_zero_that_another_program_found_is_not_this_ones(drive: Drive) -> Non
     rail.close()
 
 
+def test_a_search_at_the_drives_own_speed_is_slower_than_the_rail_may_go(drive: Drive) -> None:
+    rail = drive.homed()
+    rail.move_to(0.095).wait(60.0)
+    rail.close()
+    drive.homed(max_speed=2.0).close()
+
+
 def test_a_drive_that_does_not_begin_to_search_is_not_homed(drive: Drive) -> None:
     drive.homed().close()
     deaf = config({**PATHS, "home": {"address": 0x6002, "value": 0x77}})

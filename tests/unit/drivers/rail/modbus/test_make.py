@@ -36,6 +36,8 @@ def test_a_number_of_two_registers_comes_back(value: int) -> None:
     assert number.decode(number.encode(value)) == value
     with pytest.raises(ValueError, match="16 bits"):
         NumberConfig(address=0, words=1).encode(70_000)
+    with pytest.raises(ValueError, match="16 bits with a sign"):
+        NumberConfig(address=0, words=1).encode(32_800, signed=True)
 
 
 @pytest.mark.parametrize("unit", ["rpm/s", "1/6 rps/s", "counts/s^2", "ms to 1000 rpm"])
