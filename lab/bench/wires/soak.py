@@ -4,14 +4,15 @@ Counted after each job, for this process and each that it has started: memory, t
 median slope between all pairs of jobs after the first ones, so that one odd job does not make it.
 """
 
-import itertools
 import os
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import psutil
+from scipy.stats import theilslopes
 
 from cell.run.session.supervisor import Cell
 from drivers.errors import Aborted, CalibrationStale, CellError, ConfigError
@@ -68,47 +69,26 @@ def _job(cell: Cell, job: str) -> tuple[str, str]:
 def counted(owner: int) -> dict[str, dict[str, float]]:
     """Memory (resident, MB), threads and open handles of a process and of all that it has started, by what they are."""
     found: dict[str, dict[str, float]] = {}
-    for process in [owner, *descendants(owner)]:
-        folder = Path(f"/proc/{process}")
-        try:
-            status = dict(line.split(":", 1) for line in (folder / "status").read_text().splitlines())
-            name = "this program" if process == owner else _name(folder)
-            handles = len(list((folder / "fd").iterdir()))
-            row = {
-                "memory_mb": int(status["VmRSS"].split()[0]) / 1024.0, "threads": float(status["Threads"]),
-                "handles": float(handles),
-            }  # fmt: skip
-        except (OSError, KeyError):
-            # It has just ended.
-            continue
-        for key, value in row.items():
-            found.setdefault(name, {}).setdefault(key, 0.0)
-            found[name][key] += value
+    top = psutil.Process(owner)
+    for process in [top, *top.children(recursive=True)]:
+        # One may just have ended.
+        with suppress(psutil.NoSuchProcess):
+            name = "this program" if process == top else _name(process.cmdline())
+            memory, threads, handles = process.memory_info().rss / 2**20, process.num_threads(), process.num_fds()
+            row = found.setdefault(name, dict.fromkeys(MOST_GROWTH, 0.0))
+            for key, value in zip(MOST_GROWTH, (memory, threads, handles), strict=True):
+                row[key] += value
     return found
 
 
-def _name(folder: Path) -> str:
+def _name(words: list[str]) -> str:
     """What a process is: the module that it runs."""
-    words = (folder / "cmdline").read_bytes().decode("utf-8", "replace").split("\0")
-    return (
-        words[words.index("-m") + 1]
-        if "-m" in words
-        else Path(next((w for w in words if w.endswith(".py")), words[0])).name
-    )
+    return words[words.index("-m") + 1] if "-m" in words else Path(words[0] if words else "").name
 
 
 def descendants(owner: int) -> list[int]:
     """All processes that `owner` has started, and those that they have."""
-    parents: dict[int, int] = {}
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            parents[int(stat.parent.name)] = int(stat.read_text().rpartition(")")[2].split()[1])
-        except (OSError, ValueError, IndexError):
-            continue
-    found = {owner}
-    while more := {process for process, parent in parents.items() if parent in found} - found:
-        found |= more
-    return sorted(found - {owner})
+    return sorted(process.pid for process in psutil.Process(owner).children(recursive=True))
 
 
 def growth_of(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
@@ -118,14 +98,9 @@ def growth_of(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
         return {}
     names = set.intersection(*(set(row["processes"]) for row in kept))
     return {
-        name: {key: _slope([row["processes"][name][key] for row in kept]) for key in MOST_GROWTH}
+        name: {key: float(theilslopes([row["processes"][name][key] for row in kept])[0]) for key in MOST_GROWTH}
         for name in sorted(names)
     }
-
-
-def _slope(values: list[float]) -> float:
-    pairs = itertools.combinations(enumerate(values), 2)
-    return float(np.median([(late - early) / (k - j) for (j, early), (k, late) in pairs]))
 
 
 def verdict(growth: dict[str, dict[str, float]]) -> str:
