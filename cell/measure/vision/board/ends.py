@@ -160,9 +160,7 @@ def check_chess_ends(image: Image, spec: BoardSpec, plane: PlaneMap) -> None:
         inner, differences = at[0], np.diff(at, axis=1)
         difference = differences[0]
         # Not a number where the line lies outside the picture: there no end is seen.
-        known = np.abs(difference[np.isfinite(difference)])
-        typical = float(np.median(known)) if len(known) else np.inf
-        seen = np.abs(difference) > max(3.0, 0.4 * typical)
+        seen = np.abs(difference) > max(3.0, 0.4 * typical(np.abs(difference)))
         seen[1:] &= np.sign(difference[1:]) != np.sign(difference[:-1])
         # 1 where the last squares are, −1 where squares follow, 0 where neither column is told from the other.
         share = differences / np.where(difference == 0, 1.0, difference)

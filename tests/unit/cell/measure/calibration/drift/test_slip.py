@@ -10,20 +10,8 @@ from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import load_config
 from cell.measure.calibration import ScanObservation
 from cell.measure.calibration.drift.evidence import PictureMeasurements, dots_of
-from cell.measure.calibration.drift.reference_plate import Edge, PlateLine
-from cell.measure.calibration.drift.slip import (
-    CHANCE,
-    LARGEST_LAG_S,
-    LARGEST_M,
-    NOTED_M,
-    SUSPICIOUS,
-    HeadShift,
-    Slip,
-    slip_since,
-)
+from cell.measure.calibration.drift.slip import CHANCE, LARGEST_LAG_S, LARGEST_M, NOTED_M, SUSPICIOUS, HeadShift, Slip
 from cell.measure.calibration.solve.normal import HAND
-from cell.measure.geometry.camera import CameraModel
-from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_matrix
 from cell.procedures.arm.photograph import interim_view
 from drivers.errors import RefusedError
@@ -57,26 +45,6 @@ def test_what_is_small_is_silent_what_is_more_is_stated_and_the_rest_is_refused(
     for lag, told in ((-1.1, "11.0 ms earlier"), (1.1, "11.0 ms later"), (np.nan, "nan ms")):
         with pytest.raises(RefusedError, match=told):
             Slip(0.0, 0.0, lag * LARGEST_LAG_S).require()
-
-
-@pytest.mark.parametrize(("low", "high"), [(-9e-3, 9e-3), (-20e-3, 9e-3), (-9e-3, 20e-3), (-20e-3, 20e-3)])
-def test_a_slip_across_is_told_only_where_the_picture_holds_both_ends_of_the_line(low: float, high: float) -> None:
-    camera = CameraModel(640, 480, 1667.0, 1667.0, 319.5, 239.5)
-    across = (np.arange(480) - camera.cy) / camera.fy * 0.085
-
-    def plate(head: float) -> PlateLine:
-        lit = np.flatnonzero((across + head > low) & (across + head < high))[5:-5]
-        columns = np.full(480, np.nan)
-        columns[lit] = 200.0
-        return PlateLine(0.0, columns, np.full(480, 0.05), Edge(0.005, 0.0))
-
-    plane = LightPlane.from_baseline(0.035, np.arctan(3.5))
-    slip = slip_since(plate(0.0), plate(0.14e-3), camera, plane, np.array([1.0, 0.0, 0.0]))
-    assert slip.hidden == (max(-low, high) > 12e-3)
-    if slip.hidden:
-        assert slip.across == 0.0 and "not in the picture" in slip.notes[-1]
-    else:
-        assert slip.across == pytest.approx(0.14e-3, rel=0.1)
 
 
 @pytest.fixture(scope="module")
