@@ -128,9 +128,10 @@ def check_hidden_sides(smooth: Image, spec: BoardSpec, plane: PlaneMap, found: N
         line = own[at_line].astype(np.float64)
         outward = np.zeros(2)
         outward[axis] = sign
-        there = grey(smooth, plane.pixels(np.vstack([line + beyond * outward, line + outward])))
-        margin, next_line = there[: len(line)], there[len(line) :]
-        seen = np.isfinite(margin) & np.isfinite(next_line)
+        there = grey(smooth, plane.pixels(np.vstack([line + beyond * outward, line + 1.5 * outward])))
+        # A point beyond is measured only where the picture holds all of it.
+        margin, behind = there[: len(line)], there[len(line) :]
+        seen = np.isfinite(margin) & np.isfinite(behind)
         bright = (margin > black[at_line] + AS_WHITE * (white - black)[at_line])[seen]
         if seen.sum() >= 2 and bright.mean() > 0.6:
             raise OtherBoard(
