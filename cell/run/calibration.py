@@ -41,10 +41,9 @@ def serial_numbers(devices: Devices) -> dict[str, str]:
     One that is simulated beside real ones says so: what was calibrated with it never passes for a real one's, nor the
     other way round.
     """
-    names = ("arm", "rail", "scan_camera", "target_camera")
-    owners: tuple[Device, ...] = (devices.arm, devices.rail, devices.scan_camera, devices.target_camera)
+    owners: dict[str, Device] = {n: getattr(devices, n) for n in ("arm", "rail", "scan_camera", "target_camera")}
     simulated = () if devices.following is None else devices.following.simulated
-    return marked({name: owner.identity().serial for name, owner in zip(names, owners, strict=True)}, simulated)
+    return marked({name: owner.identity().serial for name, owner in owners.items()}, simulated)
 
 
 def marked(serials: dict[str, str], simulated: Collection[str]) -> dict[str, str]:
