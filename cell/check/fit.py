@@ -17,6 +17,7 @@ from cell.config.cell_config import CALIBRATION_DEPTHS, CellConfig
 from cell.config.job import Job, item_names, load_job
 from cell.measure.geometry.poses import transform
 from cell.measure.vision.board.view import BoardSpec, centre_of, parse_board
+from cell.measure.vision.stripe_on_board import MARGIN_PITCHES
 from cell.motion.collision import tool_bodies, vehicle_bodies
 from cell.procedures.arm.photograph import look_pose
 from cell.procedures.drive.driving import Planar
@@ -135,17 +136,18 @@ def _boards(job: Job, config: CellConfig) -> Iterator[str]:
             f"plate of {1e3 * PLATE[0]:g} x {1e3 * PLATE[1]:g} mm of the collision check; take a smaller board"
         )
     deck = config.calibration
-    for key, board, camera, name, depths in (
-        ("board.spec", station, config.target_camera, "target_camera", (job.photo.stand_off,)),
+    for key, board, camera, name, depth in (
+        ("board.spec", station, config.target_camera, "target_camera", job.photo.stand_off),
         ("calibration.fine.board", parse_board(deck.fine.board), config.scan_camera, "scan_camera",
-         CALIBRATION_DEPTHS["fine"][1:2]),
+         CALIBRATION_DEPTHS["fine"][1]),
         ("calibration.large.board", parse_board(deck.large.board), config.target_camera, "target_camera",
-         CALIBRATION_DEPTHS["large"][1:2]),
+         CALIBRATION_DEPTHS["large"][1]),
     ):  # fmt: skip
         if board.symmetric:
             yield f"{key} {board.name} looks the same when it is turned by half a turn; take marked_dots or charuco"
-        for depth in depths:
-            yield from _in_picture(key, board, camera, name, depth)
+        if camera is config.scan_camera and board.kind not in MARGIN_PITCHES:
+            yield f"{key} {board.name}: no stripe is read on it; take a board of these: {', '.join(MARGIN_PITCHES)}"
+        yield from _in_picture(key, board, camera, name, depth)
 
 
 def _sight(job: Job, config: CellConfig) -> Iterator[str]:

@@ -41,10 +41,9 @@ def serial_numbers(devices: Devices) -> dict[str, str]:
     One that is simulated beside real ones says so: what was calibrated with it never passes for a real one's, nor the
     other way round.
     """
-    names = ("arm", "rail", "scan_camera", "target_camera")
-    owners: tuple[Device, ...] = (devices.arm, devices.rail, devices.scan_camera, devices.target_camera)
+    owners: dict[str, Device] = {n: getattr(devices, n) for n in ("arm", "rail", "scan_camera", "target_camera")}
     simulated = () if devices.following is None else devices.following.simulated
-    return marked({name: owner.identity().serial for name, owner in zip(names, owners, strict=True)}, simulated)
+    return marked({name: owner.identity().serial for name, owner in owners.items()}, simulated)
 
 
 def marked(serials: dict[str, str], simulated: Collection[str]) -> dict[str, str]:
@@ -117,8 +116,9 @@ def calibrate(cell: OpenCell, run: Run[object], job: str | Path) -> CellCalibrat
 def _require_writable(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
+        with tempfile.TemporaryFile(dir=folder) as file:
+            # A full disk takes an empty file.
+            file.write(bytes(1_000_000))
     except OSError as error:
         raise CellError(
             f"no calibration can be stored in {folder}: {error}. `df -h` tells whether the disk is full, `ls -ld` who "
@@ -135,11 +135,12 @@ def kept_if_refused(folder: Path, name: str) -> Iterator[None]:
     try:
         yield
     except TimesRefused as refused:
-        path = folder / f"{name}.json"
-        # One that cannot be read, or was edited, is not used anyway.
-        with suppress(CalibrationStale):
-            old = store.read_calibration(path)
-            store.save_calibration(replace(old, scan=replace(old.scan, refused=str(refused))), path)
+        for path in folder.glob("*.json"):
+            # One that cannot be read, or was edited, is not used anyway.
+            with suppress(CalibrationStale):
+                old = store.read_calibration(path)
+                if old.name == name:
+                    store.save_calibration(replace(old, scan=replace(old.scan, refused=str(refused))), path)
         raise
 
 

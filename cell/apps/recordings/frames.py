@@ -28,7 +28,7 @@ from cell.measure.geometry.poses import difference, mean
 from cell.measure.vision.board.board import find_board
 from cell.measure.vision.board.view import BoardSpec, BoardView
 from cell.measure.vision.pictures import PictureRefused, Reason, read_picture
-from cell.measure.vision.stripe.planes import LaserChannel, read_colours
+from cell.measure.vision.stripe.planes import LaserChannel, range_of, read_colours
 from cell.measure.vision.stripe.profile import StripeProfile
 from drivers.errors import ConfigError
 
@@ -245,7 +245,9 @@ def _drawn_into(frame: RecordedFrame, other: RecordedFrame) -> bool:
 
 def _coloured(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
     """A picture (h, w, 3) of 8 bits, red first."""
-    eight = (image >> 8).astype(np.uint8) if image.dtype == np.uint16 else np.asarray(image, dtype=np.uint8)
+    if image.dtype == np.uint16:
+        image = (image * np.float32(255 / range_of(image))).astype(np.uint8)
+    eight = np.asarray(image, dtype=np.uint8)
     return np.repeat(eight[:, :, None], 3, axis=2) if eight.ndim == 2 else np.ascontiguousarray(eight[:, :, :3])
 
 

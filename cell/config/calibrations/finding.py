@@ -16,9 +16,9 @@ def find_calibration(
     `kinematics` names the arm's table, as of `kinematics_name`; `untold` says why the arm has not told it now, if so.
     An edited copy beside it is passed over; `scan.unread` says so, and jobs warn of it.
 
-    Raises `CalibrationStale` that says what is missing or what differs, `CalibrationEdited` where the file that the
-    cell writes was edited or nothing intact is of these devices, and `NotConnectedError` when the arm has to be asked
-    again before anybody can tell.
+    Raises `CalibrationStale` that says what is missing, what differs, or why the file that the cell writes cannot be
+    read, `CalibrationEdited` where that file was edited or nothing intact is of these devices, and `NotConnectedError`
+    when the arm has to be asked again before anybody can tell.
     """
     found, unreadable, edited = _stored(folder, identities)
     own = [entry for entry in found if entry.identities == identities]
@@ -85,19 +85,20 @@ def _stored(
 ) -> tuple[list[CellCalibration], list[tuple[str, str]], list[CalibrationEdited]]:
     """The calibrations in `folder`; name and trouble of each file that cannot be read; edited copies of these devices'.
 
-    Raises `CalibrationEdited` as `find_calibration` does.
+    The file that the cell writes comes first: a copy is of the same age, and lacks what was added since.
     """
+    own = name_of(identities)
     found: list[CellCalibration] = []
     unreadable: list[tuple[str, str]] = []
     edited: list[CalibrationEdited] = []
-    for path in sorted(folder.glob("*.json")) if folder.is_dir() else []:
+    for path in sorted(folder.glob("*.json"), key=lambda path: (path.stem != own, path)):
         try:
             found.append(read_calibration(path))
         except CalibrationStale as error:
+            # Another file of these devices may be older.
+            if path.stem == own:
+                raise
             if isinstance(error, CalibrationEdited) and error.identities == identities:
-                # Another file of these devices may be older than what was edited.
-                if path.stem == name_of(identities):
-                    raise
                 edited.append(error)
             unreadable.append((path.name, str(error)))
     if edited and not any(entry.identities == identities for entry in found):

@@ -153,11 +153,8 @@ class CellCalibration:
     kinematics: str = ""
     edits: tuple[dict[str, Any], ...] = ()
 
-    def __str__(self) -> str:
-        return f"calibration of {self.date}, hash {self.hash()}"
-
     def __repr__(self) -> str:
-        return f"<CellCalibration of {self.date}, hash {self.hash()}>"
+        return f"calibration of {self.date}, hash {self.hash()}"
 
     @property
     def date(self) -> str:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.vision.board.view import DOTS, BoardSpec
 from cell.measure.vision.stripe.profile import StripeProfile
+from drivers.errors import RefusedError
 
 # How far beyond the outermost points there is board for certain, in pitches.
 MARGIN_PITCHES = {"marked_dots": 0.8, "asymmetric_dots": 0.8, "dots": 0.8, "chessboard": 2.0, "charuco": 1.5}
@@ -36,10 +37,10 @@ def on_plane(camera: CameraModel, camera_from_board: pin.SE3, pixels: Array) -> 
 def points_on_board(
     camera: CameraModel, camera_from_board: pin.SE3, spec: BoardSpec, profile: StripeProfile, dot_radius: float
 ) -> NDArray[np.intp]:
-    """Rows of the profile whose stripe lies cleanly on the board; empty when there are too few."""
+    """Rows of the profile whose stripe lies cleanly on the board, empty when too few; `RefusedError` without room."""
     rows = profile.rows
-    if len(rows) < LEAST_POINTS:
-        return np.empty(0, dtype=np.intp)
+    if spec.kind not in MARGIN_PITCHES:
+        raise RefusedError(f"no stripe is read on {spec.name}; take a board of these: {', '.join(MARGIN_PITCHES)}")
     seen = on_plane(camera, camera_from_board, profile.pixels())
     local = (seen - camera_from_board.translation) @ camera_from_board.rotation
     points = spec.points()[:, :2]

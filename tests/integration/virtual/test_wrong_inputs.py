@@ -126,6 +126,7 @@ WRONG_CONFIGURATIONS: list[tuple[str, str | None, tuple[str, ...]]] = [
     ("calibration.fine.board", '"marked_dots:11"', ("calibration.fine.board", "KIND:COLSxROWS:PITCH")),
     ("calibration.fine.board", '"marked_dots:11x9:30mm"', ("calibration.fine.board", "pixels of 640 x 480")),
     ("calibration.fine.board", '"dots:11x9:3mm"', ("calibration.fine.board", "half a turn")),
+    ("calibration.fine.board", '"aprilgrid:5x4:3mm"', ("calibration.fine.board", "no stripe", "marked_dots")),
     ("calibration.large.board", '"marked_dots:9x7:1mm"', ("calibration.large.board", "pixels apart")),
     ("calibration.fine.base_from_board", pose(-5650, 262, 20, 180), ("fine.base_from_board", "not on the deck")),
     ("calibration.large.base_from_board", pose(-680, -190, 900, 180), ("calibration.large.base_from_board", "300 mm")),

@@ -43,12 +43,14 @@ LEVER = 1.5
 """What a head that has turned on its mount does at the surface, of what it does at the nearer plate."""
 ENDS_DIFFER = 3.0
 """By so many rows more at one end than at the other the line is covered, not shifted."""
+RIM_ROWS = 8
+"""An end of the line that is so near to the picture's rim is the picture's, not the plate's."""
 
 
 @dataclass(frozen=True)
 class Slip:
     """How far the head has moved against the plate since the calibration: `along` the rail's way and `across` it, m, in
-    the camera's frame (across: 0 where a covered end hides it, which `hidden` says), and how much later, s, its
+    the camera's frame (across: 0 where an end is not seen, which `hidden` says), and how much later, s, its
     pictures come (`lag`). `depth` is how far the plate is from the camera, m."""
 
     along: float
@@ -95,7 +97,7 @@ class Slip:
         if self.hidden:
             made.append(
                 "whether the scan head has slipped across the rail is not seen: an end of the laser's line on the "
-                "plate on the claw is covered. Clean the plate"
+                "plate on the claw is covered or not in the picture. Clean the plate, or take a narrower one"
             )
         return tuple(made)
 
@@ -143,8 +145,10 @@ def slip_since(
     # A laser that points elsewhere meets the plate elsewhere, and its edge at another place of the rail.
     by_line = per_px * float(np.median(now.columns[both] - before.columns[both]))
     along = (now.edge.place - before.edge.place) * float(rail_direction[0]) + by_line
-    ends = now.rows[[0, -1]] - before.rows[[0, -1]]
-    hidden = bool(abs(ends[1] - ends[0]) > ENDS_DIFFER)
+    there, was = now.rows[[0, -1]], before.rows[[0, -1]]
+    ends = there - was
+    beyond = min(there[0], was[0]) < RIM_ROWS or max(there[1], was[1]) >= len(now.columns) - RIM_ROWS
+    hidden = bool(beyond or abs(ends[1] - ends[0]) > ENDS_DIFFER)
     # The plate is seen to move against the head; the head has moved the other way.
     across = 0.0 if hidden else -per_px * camera.fx / camera.fy * float(ends.mean())
     return Slip(-along, across, now.edge.lag - before.edge.lag, hidden, depth)

@@ -31,7 +31,7 @@ from cell.measure.vision.board.view import BoardView
 from drivers.errors import RefusedError
 
 if TYPE_CHECKING:
-    from cell.measure.calibration.solve.choice import Choice, Solution
+    from cell.measure.calibration.solve.choice import Choice
     from cell.measure.calibration.solve.joint import Joint
 
 Part = Literal["intrinsics", "hand_eye", "light_plane"]
@@ -301,6 +301,7 @@ def hand_eye_checks(choice: Choice, boards: Sequence[pin.SE3], pictures: Intrins
     off = best.left.figures["board_mm"]
     arm_mm = 1e3 * choice.arm[0]
     count = len(boards)
+    over = float(np.max(best.scatter[HAND] / np.maximum(best.formal[HAND], 1e-9))) if best.joint else 0.0
     made = [
         QualityCheck(
             "hand_eye", "σ of its place", 100 * float(shift.max()) / reach, 1.0, 5.0, unit="% of the board's distance",
@@ -323,7 +324,7 @@ def hand_eye_checks(choice: Choice, boards: Sequence[pin.SE3], pictures: Intrins
             "pictures",
         ),
         QualityCheck(
-            "hand_eye", "scatter of left-out solutions over the formal σ", _ratio(best), 3.0, refuse=math.inf, unit="",
+            "hand_eye", "scatter of left-out solutions over the formal σ", over, 3.0, refuse=math.inf, unit="",
             says="the residuals are not independent noise; the larger of both is stated",
         ),
         _closed_against(choice, reach),
@@ -372,11 +373,6 @@ def _camera_against(choice: Choice, pictures: Intrinsics) -> list[QualityCheck]:
             "size or the lens is not what it is taken for",
         )
     ]  # fmt: skip
-
-
-def _ratio(best: Solution) -> float:
-    formal = np.maximum(best.formal[HAND], 1e-9)
-    return float(np.max(best.scatter[HAND] / formal)) if best.joint else 0.0
 
 
 def _mm(values: Array) -> str:

@@ -182,7 +182,7 @@ def effective_hand_eye_covariance(joint: Joint) -> Array:
     looks like a turn of the camera): what remains, when a board is seen through both, is given here as if it were the
     hand-eye's alone, as the mean over the calibration's views.
     """
-    state, covariance = joint.adjusted.state, joint.adjusted.covariance
+    state, covariance = joint.adjusted.state, joint.adjusted.reliable_covariance
     both = np.r_[np.arange(normal.CAMERA.start, normal.CAMERA.stop), np.arange(normal.HAND.start, normal.HAND.stop)]
     known = covariance[np.ix_(both, both)]
     parts = []

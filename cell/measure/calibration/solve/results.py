@@ -149,28 +149,25 @@ class ScanCalibration:
     def as_dict(self) -> dict[str, object]:
         """For storage. What was found out since the calibration has its key only where there is any."""
         found = {"confirmed": self.confirmed, "timing": self.timing, "shutter": self.shutter}
-        refused = {"refused": self.refused} if self.refused else {}
-        return (
-            {name: dict(vars(one)) for name, one in found.items() if one is not None}
-            | refused
-            | {
-                "camera": self.camera.as_dict(),
-                "light_plane": {
-                    "normal": list(self.light_plane.normal),
-                    "distance": self.light_plane.distance,
-                    "bow": self.light_plane.bow,
-                    "bow_sigma": self.bow_sigma,
-                    "bow_gain": self.bow_gain.tolist(),
-                },
-                "rail_direction": self.rail_direction.tolist(),
-                "flange_from_camera": self.flange_from_camera.homogeneous.tolist(),
-                "covariance": self.covariance.tolist(),
-                "quality": vars(self.quality),
-                "reference": None if self.reference is None else self.reference.as_dict(),
-                "notes": list(self.notes),
-                "witness": None if self.witness is None else self.witness.as_dict(),
-            }
-        )
+        return {
+            **{name: dict(vars(one)) for name, one in found.items() if one is not None},
+            **({"refused": self.refused} if self.refused else {}),
+            "camera": self.camera.as_dict(),
+            "light_plane": {
+                "normal": list(self.light_plane.normal),
+                "distance": self.light_plane.distance,
+                "bow": self.light_plane.bow,
+                "bow_sigma": self.bow_sigma,
+                "bow_gain": self.bow_gain.tolist(),
+            },
+            "rail_direction": self.rail_direction.tolist(),
+            "flange_from_camera": self.flange_from_camera.homogeneous.tolist(),
+            "covariance": self.covariance.tolist(),
+            "quality": vars(self.quality),
+            "reference": None if self.reference is None else self.reference.as_dict(),
+            "notes": list(self.notes),
+            "witness": None if self.witness is None else self.witness.as_dict(),
+        }
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:

@@ -87,14 +87,12 @@ def plane_from_board(
     """
     rows, points = [], []
     for pose, view, profile in zip(camera_from_board, views, profiles, strict=True):
-        chosen = (
-            np.empty(0, dtype=np.intp)
-            if profile is None
-            else points_on_board(camera, pose, view.spec, profile, view.dot_radius)
-        )
-        rows.append(chosen)
-        if profile is not None and len(chosen):
-            points.append(on_plane(camera, pose, stripe_pixels(profile, chosen)))
+        if profile is None:
+            rows.append(np.empty(0, dtype=np.intp))
+            continue
+        rows.append(points_on_board(camera, pose, view.spec, profile, view.dot_radius))
+        if len(rows[-1]):
+            points.append(on_plane(camera, pose, stripe_pixels(profile, rows[-1])))
     if not points:
         raise RefusedError(
             "no frame shows the laser stripe on the board; is the laser on, and does it cross the board?"

@@ -17,7 +17,7 @@ from cell.measure.vision.board.chess import find_chessboard
 from cell.measure.vision.board.dots import find_dots
 from cell.measure.vision.board.ends import OtherBoard
 from cell.measure.vision.board.markers import find_charuco, find_tags
-from cell.measure.vision.board.view import DOTS, BoardSpec, BoardView
+from cell.measure.vision.board.view import BoardSpec, BoardView
 from cell.measure.vision.pictures import Image, PictureRefused, Reason, check_picture
 
 STEPS = 30
@@ -60,9 +60,7 @@ def find_board(image: Image, spec: BoardSpec) -> BoardView:
     if image.ndim != 2 or image.dtype != np.uint8:
         raise ValueError(f"the board needs a grey 8-bit image, not {image.dtype} of shape {image.shape}")
     check_picture(image)
-    if spec.kind == "chessboard":
-        return without_outliers(find_chessboard(image, spec))
-    find = _find_dots if spec.kind in DOTS else find_tags if spec.kind == "aprilgrid" else find_charuco
+    find = {"chessboard": find_chessboard, "aprilgrid": find_tags, "charuco": find_charuco}.get(spec.kind, _find_dots)
     return without_outliers(find(image, spec))
 
 

@@ -128,9 +128,10 @@ def check_hidden_sides(smooth: Image, spec: BoardSpec, plane: PlaneMap, found: N
         line = own[at_line].astype(np.float64)
         outward = np.zeros(2)
         outward[axis] = sign
-        there = grey(smooth, plane.pixels(np.vstack([line + beyond * outward, line + outward])))
-        margin, next_line = there[: len(line)], there[len(line) :]
-        seen = np.isfinite(margin) & np.isfinite(next_line)
+        there = grey(smooth, plane.pixels(np.vstack([line + beyond * outward, line + 1.5 * outward])))
+        # A point beyond is measured only where the picture holds all of it.
+        margin, behind = there[: len(line)], there[len(line) :]
+        seen = np.isfinite(margin) & np.isfinite(behind)
         bright = (margin > black[at_line] + AS_WHITE * (white - black)[at_line])[seen]
         if seen.sum() >= 2 and bright.mean() > 0.6:
             raise OtherBoard(
@@ -160,9 +161,7 @@ def check_chess_ends(image: Image, spec: BoardSpec, plane: PlaneMap) -> None:
         inner, differences = at[0], np.diff(at, axis=1)
         difference = differences[0]
         # Not a number where the line lies outside the picture: there no end is seen.
-        known = np.abs(difference[np.isfinite(difference)])
-        typical = float(np.median(known)) if len(known) else np.inf
-        seen = np.abs(difference) > max(3.0, 0.4 * typical)
+        seen = np.abs(difference) > max(3.0, 0.4 * typical(np.abs(difference)))
         seen[1:] &= np.sign(difference[1:]) != np.sign(difference[:-1])
         # 1 where the last squares are, −1 where squares follow, 0 where neither column is told from the other.
         share = differences / np.where(difference == 0, 1.0, difference)

@@ -246,7 +246,7 @@ def _by_rings(spec: BoardSpec, places: Places, scores: Array, least: float) -> P
             Reason.AMBIGUOUS,
             "the board's three rings are not all seen clearly, so its order is not certain; move nearer",
         )
-    rings = places[order[:3]]
+    rings, fits = places[order[:3]], []
     for a, b, c in itertools.permutations(range(3)):
         two, down = rings[b] - rings[a], rings[c] - rings[a]
         if (two % 2).any():
@@ -259,14 +259,18 @@ def _by_rings(spec: BoardSpec, places: Places, scores: Array, least: float) -> P
         found = (places - rings[a]) @ inverse.T + np.array(spec.rings[0])
         inside = np.asarray(((found >= 0) & (found < (spec.cols, spec.rows))).all(axis=1), dtype=np.bool_)
         if inside.mean() > 0.9:
-            if determinant < 0:
-                raise PictureRefused(
-                    Reason.MIRRORED, "the board is seen mirrored: the picture is flipped, or the board printed so"
-                )
-            return np.where(inside[:, None], found, -1)
-    raise PictureRefused(
-        Reason.NO_BOARD, f"the dots and rings found do not fit {spec.name}: is it the board that the set-up names?"
-    )
+            fits.append((int(np.square(steps).sum()), determinant < 0, np.where(inside[:, None], found, -1)))
+    if not fits:
+        raise PictureRefused(
+            Reason.NO_BOARD, f"the dots and rings found do not fit {spec.name}: is it the board that the set-up names?"
+        )
+    # A part of a board also fits it sheared and mirrored; a board's steps are the short ones.
+    _, mirrored, found = min(fits, key=lambda fit: fit[:2])
+    if mirrored:
+        raise PictureRefused(
+            Reason.MIRRORED, "the board is seen mirrored: the picture is flipped, or the board printed so"
+        )
+    return found
 
 
 def by_outline(spec: BoardSpec, places: Places, least_share: float = LEAST_SHARE) -> list[Places]:

@@ -126,7 +126,7 @@ def as_picture(image: ArrayLike, saturation: float = FULL, full: float | None = 
     return Picture(value, image >= NEAR_FULL * full * min(1.0, saturation / FULL), False, full)
 
 
-def range_of(image: NDArray[np.uint16]) -> int:
+def range_of(image: Taken) -> int:
     """The value of a saturated pixel of a picture of 16-bit numbers: of 10, 12, 14 or 16 bits, at either end."""
     top = int(image.max())
     together = int(np.bitwise_or.reduce(image, axis=None))

@@ -1,5 +1,6 @@
 """A calibration is made for the devices that are there."""
 
+import resource
 from pathlib import Path
 
 import pytest
@@ -7,7 +8,7 @@ import pytest
 from cell import Cell
 from cell.config.cell_config import load_config
 from cell.devices.simulated.direct import VirtualCell
-from cell.run.calibration import serial_numbers
+from cell.run.calibration import _require_writable, serial_numbers
 from drivers.errors import CellError
 from tests.unit.cell.config.calibrations.test_store import DEVICES
 
@@ -25,3 +26,13 @@ def test_nothing_moves_where_a_calibration_cannot_be_stored(here: Path) -> None:
         with pytest.raises(CellError, match=r"no calibration can be stored in .*calibrations: .* `df -h` tells"):
             cell.calibrate()
         assert (cell.devices.arm.state().joints == before).all()
+
+
+def test_a_disk_that_takes_an_empty_file_only_is_full(tmp_path: Path) -> None:
+    most = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, most[1]))
+    try:
+        with pytest.raises(CellError, match="whether the disk is full"):
+            _require_writable(tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, most)

@@ -40,16 +40,16 @@ def drawn_circles(image: np.ndarray, view) -> np.ndarray:
     return image
 
 
-@pytest.mark.parametrize("kind", [".png", ".jpg"])
+@pytest.mark.parametrize("kind", [".png", ".jpg", ".tif"])
 @pytest.mark.parametrize("draw", [drawn_corners, drawn_axes, drawn_circles])
 def test_pictures_that_a_program_drew_into_are_set_aside_by_their_pixels(tmp_path, pictures, seen, draw, kind):
-    """The names say nothing, and one that misleads: a view of its own is called corners."""
+    """The names say nothing, and one that misleads: a view of its own is called corners. The .tif has 12 bits in 16."""
     for name, target in (("frame03.png", "corners.png"), ("frame04.png", "b.png"), ("frame05.png", "c.png")):
         (tmp_path / target).symlink_to(pictures / name)
     image = draw(
         cv2.cvtColor(cv2.imread(str(pictures / "frame04.png"), 0), cv2.COLOR_GRAY2BGR), seen["frame04.png"].view
     )
-    cv2.imwrite(str(tmp_path / f"a{kind}"), image)
+    cv2.imwrite(str(tmp_path / f"a{kind}"), image.astype(np.uint16) * 16 if kind == ".tif" else image)
     frames, _ = read_frames(list_folder(tmp_path), BOARD, laser=None)
     assert {f.name: f.text for f in frames if f.reason is not None} == {
         f"a{kind}": "it is b.png with lines drawn into it"

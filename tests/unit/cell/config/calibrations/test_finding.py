@@ -91,7 +91,7 @@ def test_a_newer_one_that_does_not_fit_does_not_hide_the_own_one(tmp_path: Path)
     assert found(tmp_path).made == pytest.approx(own.made)
 
 
-@pytest.mark.parametrize(
+spoilt_ways = pytest.mark.parametrize(
     "spoilt",
     [
         lambda data: json.dumps(data)[:2000],
@@ -100,6 +100,9 @@ def test_a_newer_one_that_does_not_fit_does_not_hide_the_own_one(tmp_path: Path)
     ],
     ids=["torn", "another format", "a number missing"],
 )
+
+
+@spoilt_ways
 def test_a_file_of_another_format_or_with_a_number_missing_is_none(
     tmp_path: Path, spoilt: Callable[[dict[str, Any]], str]
 ) -> None:
@@ -147,4 +150,26 @@ def test_an_edited_file_of_the_cell_itself_is_refused_beside_any_copy(tmp_path: 
     save_calibration(made(0.5 * DAY), tmp_path / "copy.json")
     edited(path, "scan", "flange_from_camera", 0, 3, value=0.001)
     with pytest.raises(CalibrationEdited, match="changed after it was written"):
+        found(tmp_path)
+
+
+@spoilt_ways
+def test_an_older_copy_does_not_stand_in_for_the_cells_own_file_that_cannot_be_read(
+    tmp_path: Path, spoilt: Callable[[dict[str, Any]], str]
+) -> None:
+    path = tmp_path / f"{made().name}.json"
+    save_calibration(made(), path)
+    save_calibration(made(20 * DAY), tmp_path / "before.json")
+    path.write_text(spoilt(json.loads(path.read_text(encoding="utf-8"))), encoding="utf-8")
+    with pytest.raises(CalibrationStale, match=rf"{path.name} cannot be read as a calibration"):
+        found(tmp_path)
+
+
+@pytest.mark.parametrize("ending", ["-old", " (copy)", "_old"])
+def test_a_copy_does_not_hide_what_the_cells_own_file_was_given_since(tmp_path: Path, ending: str) -> None:
+    own = made()
+    save_calibration(own, tmp_path / f"{own.name}{ending}.json")
+    own = replace(own, scan=replace(own.scan, refused="its shutter rolls"))
+    save_calibration(own, tmp_path / f"{own.name}.json")
+    with pytest.raises(CalibrationStale, match="holds no more, as was found since: its shutter rolls"):
         found(tmp_path)

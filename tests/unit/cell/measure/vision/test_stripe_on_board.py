@@ -2,11 +2,13 @@
 
 import numpy as np
 import pinocchio as pin
+import pytest
 
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.vision.board.view import parse_board
 from cell.measure.vision.stripe.profile import StripeProfile
 from cell.measure.vision.stripe_on_board import on_plane, points_on_board
+from drivers.errors import RefusedError
 
 CAMERA = CameraModel(640, 480, 1000.0, 1000.0, 320.0, 240.0)
 BOARD = parse_board("dots:7x7:10mm")
@@ -36,4 +38,10 @@ def test_points_on_print_and_beyond_the_board_are_left_out():
     nearest = np.linalg.norm(local[kept, None, :2] - BOARD.points()[None, :, :2], axis=2).min(axis=1)
     assert len(kept) > 100 and nearest.min() > 0.003
     assert kept.max() <= 400
-    assert not len(points_on_board(CAMERA, POSE, BOARD, stripe(20.0), 0.003))
+    for nowhere in (stripe(20.0), stripe(np.nan)):
+        assert not len(points_on_board(CAMERA, POSE, BOARD, nowhere, 0.003))
+
+
+def test_a_board_that_leaves_no_room_for_a_stripe_is_refused_with_those_that_do():
+    with pytest.raises(RefusedError, match=r"no stripe is read on .*; take a board of these: marked_dots"):
+        points_on_board(CAMERA, POSE, parse_board("aprilgrid:6x6:5mm"), stripe(322.0), 0.0)

@@ -8,7 +8,7 @@ import pytest
 
 from cell.config.cell_config import load_config
 from cell.devices.simulated.direct import VirtualCell
-from cell.measure.calibration.drift.reference_plate import PlateLine
+from cell.measure.calibration.drift.reference_plate import Edge, PlateLine
 from cell.measure.calibration.drift.slip import Slip, slip_since
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
@@ -188,6 +188,24 @@ def test_an_end_of_the_line_that_is_covered_is_no_shift(cell) -> None:
     columns[before.rows[-25:]] = np.nan
     slip = since(replace(before, columns=columns))
     assert slip.hidden and slip.across == 0.0 and "covered" in slip.notes[0]
+
+
+@pytest.mark.parametrize(("low", "high"), [(-9e-3, 9e-3), (-20e-3, 9e-3), (-9e-3, 20e-3), (-20e-3, 20e-3)])
+def test_a_slip_across_is_told_only_where_the_picture_holds_both_ends_of_the_line(low: float, high: float) -> None:
+    camera = CameraModel(640, 480, 1667.0, 1667.0, 319.5, 239.5)
+    across = (np.arange(480) - camera.cy) / camera.fy * 0.085
+
+    def plate(head: float) -> PlateLine:
+        lit = np.flatnonzero((across + head > low) & (across + head < high))[5:-5]
+        columns = np.full(480, np.nan)
+        columns[lit] = 200.0
+        return PlateLine(0.0, columns, np.full(480, 0.05), Edge(0.005, 0.0))
+
+    plane = LightPlane.from_baseline(0.035, np.arctan(3.5))
+    slip = slip_since(plate(0.0), plate(0.14e-3), camera, plane, np.array([1.0, 0.0, 0.0]))
+    assert slip.hidden == (max(-low, high) > 12e-3)
+    assert slip.across == pytest.approx(0.0 if slip.hidden else 0.14e-3, rel=0.1)
+    assert slip.hidden == ("not in the picture" in slip.notes[-1])
 
 
 def test_a_job_says_what_its_plate_does_not_show(cell) -> None:

@@ -148,8 +148,9 @@ def test_one_sweep_to_and_fro_tells_roughly_how_late_stamps_come(late: float) ->
 
 def test_what_is_refused_of_the_times_later_ends_the_stored_calibration_too(tmp_path: Path) -> None:
     """Else the job after a refused `cell calibrate` would go on with the calibration before it."""
-    old = made(0.0)
+    old = made(2.0)
     save_calibration(old, tmp_path / f"{old.name}.json")
+    save_calibration(replace(old, made=old.made + 1.0), tmp_path / "newer.json")
 
     def found() -> CellCalibration:
         return find_calibration(tmp_path, old.identities, old.configuration, 60.0)

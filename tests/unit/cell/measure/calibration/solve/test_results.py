@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cell.measure.calibration.solve.results import PARAMETERS, ScanCalibration, adjust_scan
+from cell.measure.calibration.solve.results import PARAMETERS, ScanCalibration, TargetCalibration, adjust_scan
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.poses import difference, from_matrix
 from drivers.errors import RefusedError
@@ -74,6 +74,14 @@ def test_the_target_camera_is_found(world, solved):
     off = seen(found.camera, found.flange_from_camera) - seen(true, from_matrix(world.hand))
     assert np.linalg.norm(off) < 0.3e-3
     assert np.sqrt(found.hand_eye_covariance.diagonal()[:3]).max() < 0.5e-3
+
+
+def test_the_target_cameras_covariance_counts_the_scatter_of_the_arm_that_was_found(solved):
+    calm, rough = (
+        TargetCalibration.of(replace(solved.target, adjusted=replace(solved.target.adjusted, excess={"turn": times})))
+        for times in (1.0, 3.0)
+    )
+    np.testing.assert_allclose(rough.hand_eye_covariance, 9.0 * calm.hand_eye_covariance)
 
 
 def test_views_from_one_side_do_not_make_a_camera(archived):

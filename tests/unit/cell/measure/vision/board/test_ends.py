@@ -4,10 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
+from cell.measure.geometry.poses import transform
 from cell.measure.vision.board.board import find_board
 from cell.measure.vision.board.view import parse_board
 from cell.measure.vision.pictures import PictureRefused, Reason
 from lab.bench.board.conditions import CONDITIONS, draw_view
+from tests.unit.cell.measure.vision.board.drawn_boards import LARGE, TARGET, photograph, placed
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.35])
@@ -23,6 +25,14 @@ def test_dots_with_a_frame_round_them_end_there(turn):
     assert len(view.ids) == 49
     with pytest.raises(PictureRefused, match="7×7"):
         find_board(image, parse_board("dots:7x6:25mm"))
+
+
+@pytest.mark.parametrize("pitches", [0.05, 0.2, 0.35])
+def test_a_row_that_the_pictures_rim_cuts_does_not_make_another_board(pitches):
+    pose, spec = placed(LARGE, 1.0, 0.0, spin=0.0), parse_board(LARGE)
+    first, last = np.unique(TARGET.project(transform(pose, spec.points()))[:, 1].round())[[0, -1]]
+    cut = round(first - pitches * (last - first) / 6)
+    assert len(find_board(photograph(TARGET, LARGE, pose)[cut:].copy(), spec).ids) == 54
 
 
 def view_of(name, kind, seed=0):

@@ -1,9 +1,12 @@
 """Which dot of a board is which: by its rings also in part, and of a symmetric board by an assumption."""
 
+import itertools
+
 import numpy as np
 import pytest
 
 from cell.measure.vision.board.board import find_board
+from cell.measure.vision.board.lattice import identify
 from cell.measure.vision.board.view import parse_board
 from cell.measure.vision.pictures import PictureRefused, Reason
 from tests.unit.cell.measure.vision.board.drawn_boards import FINE, LARGE, SCAN, TARGET, photograph, placed, true_pixels
@@ -22,6 +25,21 @@ def test_symmetric_dots_say_that_their_order_is_assumed():
     view = find_board(photograph(TARGET, text, pose), parse_board(text))
     off = [np.abs(view.pixels - true_pixels(TARGET, pose, turn)).max() for turn in view.turns()]
     assert view.order_assumed and len(off) == 4 and min(off) < 0.1
+
+
+@pytest.mark.parametrize("flipped", [False, True])
+def test_a_part_of_a_board_is_mirrored_where_its_picture_is_and_only_there(flipped):
+    spec = parse_board("marked_dots:20x14:5mm")
+    part = np.array([(x, y) for y in range(4, 9) for x in range(5, 16)])
+    for clearest in itertools.permutations((0.9, 0.8, 0.7)):
+        scores = np.zeros((len(part), 2))
+        for ring, score in zip(spec.rings, clearest, strict=True):
+            scores[(part == ring).all(axis=1)] = score
+        if flipped:
+            with pytest.raises(PictureRefused, match="mirrored"):
+                identify(spec, part * [-1, 1], scores)
+        else:
+            assert (identify(spec, part, scores)[0] == part).all()
 
 
 def test_a_board_without_its_rings_is_refused():
