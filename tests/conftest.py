@@ -182,7 +182,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 @pytest.fixture(scope="session")
-def placed_pot(tmp_path_factory: pytest.TempPathFactory) -> JobRecord:
+def placed_pot(tmp_path_factory) -> JobRecord:
     """The job `pot` on the virtual clock, calibrated by itself: seed 2, nominal, swept twice as fast as shipped."""
     job, nominal = pot()
     record = run_whole_job(CONFIG, job, nominal, 2, "nominal", runs=tmp_path_factory.mktemp("placed"))
@@ -191,7 +191,7 @@ def placed_pot(tmp_path_factory: pytest.TempPathFactory) -> JobRecord:
 
 
 @pytest.fixture(scope="session")
-def unloaded_part(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> JobRecord:
+def unloaded_part(placed_pot: JobRecord, tmp_path_factory) -> JobRecord:
     """The job `unload` in the world of `placed_pot`, with a part that clings to its surface."""
 
     def clings(cell: VirtualCell) -> None:
@@ -203,7 +203,7 @@ def unloaded_part(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactor
 
 
 @pytest.fixture(scope="session")
-def ends(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> Ends:
+def ends(placed_pot: JobRecord, tmp_path_factory) -> Ends:
     """Gives the run that ends as `tests.support.report_runs` says; each is made once."""
     root = tmp_path_factory.mktemp("cell") / "runs"
     made: dict[Make, Ended] = {}
@@ -217,19 +217,19 @@ def ends(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> End
 
 
 @pytest.fixture
-def station(placed_pot: JobRecord, tmp_path: Path) -> Station:
+def station(placed_pot: JobRecord, tmp_path) -> Station:
     """Gives a cell that stands where `placed_pot` placed."""
     return partial(AtStation, placed_pot, tmp_path)
 
 
 @pytest.fixture
-def lying_part(placed_pot: JobRecord, tmp_path: Path) -> Lying:
+def lying_part(placed_pot: JobRecord, tmp_path) -> Lying:
     """Gives a part that lies in the cell of `placed_pot`."""
     return partial(LyingPart, placed_pot, tmp_path)
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def here(tmp_path, monkeypatch) -> Path:
     """The present folder, which is a new one."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -244,7 +244,7 @@ def calibrated_folder(placed_pot: JobRecord, here: Path) -> Path:
 
 
 @pytest.fixture
-def typed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Typed:
+def typed(capsys, monkeypatch) -> Typed:
     """Gives what a `cell` command comes to, run in this process and folder: exit code, output, complaints."""
 
     # A process runs one command; typer puts all of them together anew for each.

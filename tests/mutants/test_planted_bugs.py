@@ -46,7 +46,7 @@ BUGS = planted()
 
 
 @pytest.fixture(scope="session")
-def copy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def copy(tmp_path_factory) -> Iterator[Path]:
     """A copy of the product and its tests; compiled kernels come along, because the times of the files are kept."""
     folder = tmp_path_factory.mktemp("planted")
     for name in PLACES:
@@ -73,14 +73,14 @@ def named(test: str) -> str:
 
 
 @pytest.mark.parametrize("file", sorted({named(test) for bug in BUGS for test in bug.tests}))
-def test_without_a_planted_bug_the_tests_pass(copy: Path, file: str) -> None:
+def test_without_a_planted_bug_the_tests_pass(copy: Path, file: str):
     tests = sorted({test for bug in BUGS for test in bug.tests if named(test) == file})
     done = run(copy, *tests)
     assert done.returncode == 0, done.stdout[-3000:]
 
 
 @pytest.mark.parametrize("bug", BUGS, ids=str)
-def test_a_planted_bug_is_noticed(copy: Path, bug: Bug) -> None:
+def test_a_planted_bug_is_noticed(copy: Path, bug: Bug):
     file = copy / bug.file
     text = file.read_text(encoding="utf-8")
     assert text.count(bug.old) == 1, f"{bug.old!r} stands {text.count(bug.old)} times in {bug.file}; plant it anew"

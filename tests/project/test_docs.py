@@ -26,24 +26,24 @@ def sections(document: str) -> list[int]:
     return [int(number) for number in re.findall(r"^## (\d+)\. ", text, re.MULTILINE)]
 
 
-def test_every_document_that_is_named_exists() -> None:
+def test_every_document_that_is_named_exists():
     named = {(document, path) for path, text in texts() for document in DOCUMENT.findall(text)}
     assert len({document for document, _ in named}) >= 5
     assert [(document, path) for document, path in sorted(named) if not (ROOT / document).is_file()] == []
 
 
-def test_every_section_that_is_cited_exists() -> None:
+def test_every_section_that_is_cited_exists():
     cited = {(document, int(number), path) for path, text in texts() for document, number in SECTION.findall(text)}
     assert {document for document, _, _ in cited} >= {"docs/explanation/theory.md", "docs/reference/protocols.md"}
     assert [entry for entry in sorted(cited) if entry[1] not in sections(entry[0])] == []
 
 
 @pytest.mark.parametrize("document", ["docs/explanation/theory.md", "docs/reference/protocols.md"])
-def test_sections_are_numbered_without_gaps(document: str) -> None:
+def test_sections_are_numbered_without_gaps(document: str):
     assert sections(document) == list(range(1, len(sections(document)) + 1))
 
 
-def test_every_place_of_the_walks_exists() -> None:
+def test_every_place_of_the_walks_exists():
     walks = (ROOT / "docs/explanation/walks.md").read_text(encoding="utf-8")
     places = re.findall(r"^\d+\. `([^`]+)`(?:, `(\w+)`)?:", walks, re.MULTILINE)
     assert len(places) > 20

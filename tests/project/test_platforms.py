@@ -19,14 +19,12 @@ NEVER = 'ur-rtde>=1.6.3,<1.7; python_version < "3"'
 
 
 @pytest.fixture
-def without_wheel(monkeypatch: pytest.MonkeyPatch) -> None:
+def without_wheel(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "rtde_control", None)
     monkeypatch.setattr("importlib.metadata.requires", lambda name: [NEVER])
 
 
-def test_a_package_without_a_wheel_here_is_named_with_the_remedy(
-    without_wheel: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_package_without_a_wheel_here_is_named_with_the_remedy(without_wheel: None, monkeypatch):
     words = lacking("rtde_control", "ur-rtde")
     assert f"ur-rtde has no wheel for Python {sys.version.split()[0]}" in words
     assert "Python 3.12 on Linux x86-64" in words
@@ -40,8 +38,8 @@ def test_a_package_without_a_wheel_here_is_named_with_the_remedy(
     [((), "virtual", True), (("--clock", "wall"), "wall", False), (("--speed", "2"), "wall", False)],
 )
 def test_a_dry_run_without_the_arms_package_takes_the_virtual_clock_and_says_so(
-    without_wheel: None, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], clock: str, said: bool
-) -> None:
+    without_wheel: None, monkeypatch, options: tuple[str, ...], clock: str, said: bool
+):
     opened: list[partial[Any]] = []
     monkeypatch.setattr(run, "_perform", lambda cell, *others: opened.append(cell))
     done = CliRunner().invoke(app, ["dry-run", *options], catch_exceptions=False)
@@ -49,9 +47,7 @@ def test_a_dry_run_without_the_arms_package_takes_the_virtual_clock_and_says_so(
     assert ("virtual clock" in done.stderr and "ur-rtde has no wheel" in done.stderr) is said
 
 
-def test_over_the_wires_it_is_refused_before_anything_is_started(
-    without_wheel: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_over_the_wires_it_is_refused_before_anything_is_started(without_wheel: None, monkeypatch):
     monkeypatch.setattr(subprocess, "Popen", lambda *given, **options: pytest.fail(f"started {given}"))
     for connect in (
         lambda: Cell.open(sim="all"),
@@ -61,6 +57,6 @@ def test_over_the_wires_it_is_refused_before_anything_is_started(
             connect()
 
 
-def test_the_doctor_asks_for_nothing_that_has_no_wheel_here(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_doctor_asks_for_nothing_that_has_no_wheel_here(monkeypatch):
     monkeypatch.setattr("cell.apps.doctor.tomllib.loads", lambda text: {"project": {"dependencies": [NEVER]}})
     assert asked_for(()) == {"": []}

@@ -34,21 +34,21 @@ def command_lines() -> list[str]:
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page == "README.md" or page.startswith("docs/tutorials/")])
-def test_a_beginner_imports_from_the_public_door_alone(page: str) -> None:
+def test_a_beginner_imports_from_the_public_door_alone(page: str):
     code = "\n".join([*blocks("py", page), *blocks("python", page)])
     assert re.findall(r"^\s*(?:from|import) cell\.\w+", code, re.MULTILINE) == []
     for names in re.findall(r"^\s*from cell import (.+)$", code, re.MULTILINE):
         assert {name.strip() for name in names.split(",")} <= set(cell.__all__)
 
 
-def test_the_relative_links_of_the_readme_lead_somewhere() -> None:
+def test_the_relative_links_of_the_readme_lead_somewhere():
     links = re.findall(r"\]\((?!http)([^)#]+)", (ROOT / "README.md").read_text(encoding="utf-8"))
     assert len(links) > 20
     assert [link for link in links if not (ROOT / link).exists()] == []
 
 
 @pytest.mark.parametrize("line", command_lines())
-def test_every_command_that_is_shown_exists_with_its_options(line: str) -> None:
+def test_every_command_that_is_shown_exists_with_its_options(line: str):
     # The laboratory's commands come by its entry point, where it is installed.
     commands = typer.Typer() if line.startswith(("cell bench", "cell paper")) else app
     if commands is not app:

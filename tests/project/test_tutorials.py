@@ -44,7 +44,7 @@ class Context:
         assert 0 <= fraction <= 1 and "deg" in text
 
 
-def test_the_step_of_the_tutorial_is_one_more_and_refuses_what_leans() -> None:
+def test_the_step_of_the_tutorial_is_one_more_and_refuses_what_leans():
     page = "docs/tutorials/own-step.md"
     kind: Kind = defined(page, "KIND")
     assert entry_points(page) == {"assembly_cell.kinds": {kind.name: "lean_step:KIND"}}
@@ -56,7 +56,7 @@ def test_the_step_of_the_tutorial_is_one_more_and_refuses_what_leans() -> None:
         step.work(None, Context(70.0))  # type: ignore[arg-type]
 
 
-def test_the_make_of_the_tutorial_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_make_of_the_tutorial_is_taken(tmp_path, monkeypatch):
     page = "docs/tutorials/own-make.md"
     ((name, where),) = entry_points(page)["assembly_cell.devices"].items()
     make: Make[Any, Any] = defined(page, "MAKE")
@@ -70,12 +70,12 @@ def test_the_make_of_the_tutorial_is_taken(tmp_path: Path, monkeypatch: pytest.M
     assert config.make("claw") is make and isinstance(config.claw, ArmOutputClawConfig) and config.claw.output == 1
 
 
-def test_the_make_of_the_how_to_is_a_record_and_a_function() -> None:
+def test_the_make_of_the_how_to_is_a_record_and_a_function():
     make: Make[Any, Any] = defined("docs/how-to/makes.md", "MAKE", "python")
     assert (make.kind, make.name, make.record.ADDRESS, make.calibrated) == ("rail", "acme", "port", {"belt"})
 
 
-def test_the_script_of_the_tutorial_makes_a_mesh(here: Path) -> None:
+def test_the_script_of_the_tutorial_makes_a_mesh(here: Path):
     defined("docs/tutorials/own-part.md", "faces")
     mesh = trimesh.load_mesh(here / "saddle.ply")
     assert mesh.extents[:2] == pytest.approx([60.0, 30.0])

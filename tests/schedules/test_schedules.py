@@ -30,11 +30,11 @@ def check(kept: dict[str, Any], calibrations: Path) -> None:
 @pytest.mark.parametrize(
     "kept", [pytest.param(k, id=k["why"], marks=[pytest.mark.campaign] if k.get("long") else []) for k in KEPT]
 )
-def test_a_kept_schedule_breaks_no_rule(kept: dict[str, Any], calibrated_folder: Path) -> None:
+def test_a_kept_schedule_breaks_no_rule(kept: dict[str, Any], calibrated_folder: Path):
     check(kept, calibrated_folder / "calibrations")
 
 
 @pytest.mark.campaign
-def test_drawn_schedules_break_no_rule(tmp_path: Path) -> None:
+def test_drawn_schedules_break_no_rule(tmp_path):
     found = campaign(["pot", "load"], ["nominal"], 40, 1000, tmp_path, workers=2, told=lambda *_: None)
     assert (found["violations"], found["schedules"]) == ([], 40)

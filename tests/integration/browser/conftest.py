@@ -27,7 +27,7 @@ def browser(browsers: playwright.Playwright) -> Iterator[playwright.Browser]:
 
 
 @pytest.fixture(scope="module")
-def console(tmp_path_factory: pytest.TempPathFactory, browsers: object) -> Iterator[Console]:
+def console(tmp_path_factory, browsers: object) -> Iterator[Console]:
     with console_of(tmp_path_factory.mktemp("screen")) as going:
         yield going
 

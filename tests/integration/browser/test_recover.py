@@ -1,6 +1,5 @@
 """Out of a fault by the screen: a homing that was stopped is asked about, an idle arm is unlocked by a button."""
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,7 +12,7 @@ from tests.support.wire.cells import ask, served, started
 pytestmark = pytest.mark.wire
 
 
-def test_a_person_unlocks_an_idle_arm_and_answers_for_a_homing(browser: Any, tmp_path: Path) -> None:
+def test_a_person_unlocks_an_idle_arm_and_answers_for_a_homing(browser: Any, tmp_path):
     with served(tmp_path, "--seed", "3", "--level", "ideal") as endpoints:
         (tmp_path / "sim.toml").rename(tmp_path / "cell.toml")
         with started("console", "--no-open", folder=tmp_path) as process:

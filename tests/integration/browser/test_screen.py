@@ -13,7 +13,7 @@ from tests.support.browser.watcher import Watcher
 pytestmark = pytest.mark.wire
 
 
-def test_a_run_is_watched_paused_and_stopped(screen: Screen, watcher: Watcher) -> None:
+def test_a_run_is_watched_paused_and_stopped(screen: Screen, watcher: Watcher):
     screen.shows("world", "SIMULATED.*seed 3")
     # Who does not hold the cell can do one thing alone.
     assert screen.page.locator("#start").is_disabled()
@@ -54,7 +54,7 @@ def test_a_run_is_watched_paused_and_stopped(screen: Screen, watcher: Watcher) -
     assert screen.complaints == []
 
 
-def test_a_held_button_moves_the_arm_until_it_is_let_go(screen: Screen, watcher: Watcher) -> None:
+def test_a_held_button_moves_the_arm_until_it_is_let_go(screen: Screen, watcher: Watcher):
     press(screen, watcher)
     # The speed is steady: a late beat here and there does not make it halt.
     begin = joint(watcher.state)
@@ -67,7 +67,7 @@ def test_a_held_button_moves_the_arm_until_it_is_let_go(screen: Screen, watcher:
     leave(screen, watcher)
 
 
-def test_a_page_that_hangs_while_a_button_is_held_stops_the_arm(screen: Screen, watcher: Watcher) -> None:
+def test_a_page_that_hangs_while_a_button_is_held_stops_the_arm(screen: Screen, watcher: Watcher):
     press(screen, watcher)
     hung = time.monotonic()
     screen.page.evaluate("setTimeout(() => { const end = Date.now() + 1500; while (Date.now() < end); })")
@@ -80,7 +80,7 @@ def test_a_page_that_hangs_while_a_button_is_held_stops_the_arm(screen: Screen, 
     leave(screen, watcher)
 
 
-def test_a_point_has_the_colour_of_its_deviation_and_another_one_on_another_scale(screen: Screen) -> None:
+def test_a_point_has_the_colour_of_its_deviation_and_another_one_on_another_scale(screen: Screen):
     colours = screen.page.evaluate(
         """async () => {
             const { Cloud } = await import(new URL('cloud.js', document.querySelector('script[type=module]').src));
@@ -106,7 +106,7 @@ def test_a_point_has_the_colour_of_its_deviation_and_another_one_on_another_scal
     assert fine[3] == wide[2]
 
 
-def test_a_dry_run_shows_how_far_it_is_and_is_cancelled(screen: Screen, watcher: Watcher) -> None:
+def test_a_dry_run_shows_how_far_it_is_and_is_cancelled(screen: Screen, watcher: Watcher):
     screen.hold()
     screen.page.click("#dry-run")
     screen.shows("dry-said", "Dry run of pot: .+ …")
@@ -138,7 +138,7 @@ BOXES = """() => Object.fromEntries(['question', 'stage', 'stop', 'state'].map((
 @pytest.mark.parametrize("size", SIZES, ids=str)
 def test_a_question_stands_beside_the_view_and_says_what_comes_of_an_answer(
     size: tuple[int, int], browser: Browser, console: Console
-) -> None:
+):
     changes: dict[str, object] = {"run": RUN, "question": ASKED}
     screen = Screen.of(browser, console.link(), size, changes=changes)
     page = screen.page
@@ -175,7 +175,7 @@ ENDS = [
 ]
 
 
-def test_a_start_is_said_at_once_and_once_and_a_run_ends_with_its_figure(browser: Browser, console: Console) -> None:
+def test_a_start_is_said_at_once_and_once_and_a_run_ends_with_its_figure(browser: Browser, console: Console):
     changes: dict[str, object] = {}
     screen = Screen.of(browser, console.link(), changes=changes)
     page = screen.page
@@ -209,9 +209,7 @@ def test_a_start_is_said_at_once_and_once_and_a_run_ends_with_its_figure(browser
     screen.close()
 
 
-def test_the_first_load_is_small_and_the_next_asks_only_whether_it_is_the_same(
-    browser: Browser, console: Console
-) -> None:
+def test_the_first_load_is_small_and_the_next_asks_only_whether_it_is_the_same(browser: Browser, console: Console):
     """Over the wire, headers and all; without it three.js alone had 1.3 MB."""
     screen = Screen.of(browser, console.link())
     sizes = """() => ['navigation', 'resource'].flatMap((type) => performance.getEntriesByType(type))
@@ -229,7 +227,7 @@ def test_the_first_load_is_small_and_the_next_asks_only_whether_it_is_the_same(
     screen.close()
 
 
-def test_an_error_is_told_in_a_sentence(screen: Screen) -> None:
+def test_an_error_is_told_in_a_sentence(screen: Screen):
     answers = {
         '{"ok": false, "error": "missing", "text": "there is no such run"}': "There is no such run.",
         '{"detail": 1}': "The server refused this .404.. Load the page again.",

@@ -5,7 +5,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, Playwright
@@ -21,7 +20,7 @@ pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 FAULT = "arm.protective_stop@laser_sweep:40%"
 
 
-def test_a_whole_dry_run_is_seen_and_decided_upon(browsers: Playwright, tmp_path: Path) -> None:
+def test_a_whole_dry_run_is_seen_and_decided_upon(browsers: Playwright, tmp_path):
     """All the way to the placed part, with a protective stop on the way that waits for a person."""
     command = ("dry-run", "--console", "--no-open", "--seed", "3", "--inject", FAULT)
     with started(*command, folder=tmp_path) as process:
@@ -76,9 +75,7 @@ ENDS: dict[str, Callable[[Screen], None]] = {
 
 
 @pytest.mark.parametrize("end", ENDS)
-def test_whatever_ends_holding_a_button_ends_the_motion(
-    end: str, browser: Browser, console: Console, watcher: Watcher
-) -> None:
+def test_whatever_ends_holding_a_button_ends_the_motion(end: str, browser: Browser, console: Console, watcher: Watcher):
     screen = Screen.of(browser, console.link())
     press(screen, watcher)
     begun = time.monotonic()
@@ -88,7 +85,7 @@ def test_whatever_ends_holding_a_button_ends_the_motion(
     watcher.until(lambda state: idle(state) and state["holder"] is None, timeout=30.0)
 
 
-def test_a_killed_browser_stops_the_arm(browsers: Playwright, console: Console, watcher: Watcher) -> None:
+def test_a_killed_browser_stops_the_arm(browsers: Playwright, console: Console, watcher: Watcher):
     browser = opened_browser(browsers)
     screen = Screen.of(browser, console.link())
     press(screen, watcher)
@@ -98,7 +95,7 @@ def test_a_killed_browser_stops_the_arm(browsers: Playwright, console: Console, 
     watcher.until(lambda state: state["holder"] is None, timeout=30.0)
 
 
-def test_a_lost_server_is_told_at_once(browser: Browser, tmp_path: Path) -> None:
+def test_a_lost_server_is_told_at_once(browser: Browser, tmp_path):
     with console_of(tmp_path) as console:
         screen = Screen.of(browser, console.link())
         console.process.send_signal(signal.SIGSTOP)
@@ -114,8 +111,8 @@ def test_a_lost_server_is_told_at_once(browser: Browser, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("size", [(1280, 800), PHONE], ids=["wide", "phone"])
 def test_stop_is_in_sight_and_nothing_is_cut_off(
-    size: tuple[int, int], browsers: Playwright, console: Console, tmp_path: Path
-) -> None:
+    size: tuple[int, int], browsers: Playwright, console: Console, tmp_path
+):
     browser = opened_browser(browsers, drawn=True)
     screen = Screen.of(browser, console.link(), size)
     page = screen.page
@@ -139,7 +136,7 @@ SOAKED_S, MOST_MB_A_HOUR, A_PAGE_OF_MEMORY_MB = 300.0, 1.0, 0.3
 BUSY = "while True: pass"
 
 
-def test_a_console_that_goes_on_does_not_grow(browsers: Playwright, tmp_path: Path) -> None:
+def test_a_console_that_goes_on_does_not_grow(browsers: Playwright, tmp_path):
     """Idle, with a page that homes the rail, and while its readings come late: the second half of each phase counts."""
     with console_of(tmp_path, "--speed", "0.3") as console:
         link, browser = console.link(), opened_browser(browsers)

@@ -35,7 +35,7 @@ a line of JSON: host, cookie, key, count."""
 
 
 @pytest.mark.parametrize("pages", [1, 5])
-def test_states_pictures_and_cloud_take_at_most_a_twentieth_of_a_core(tmp_path: Path, pages: int) -> None:
+def test_states_pictures_and_cloud_take_at_most_a_twentieth_of_a_core(tmp_path, pages: int):
     noise = np.random.default_rng(0).normal(60.0, 4.0, (480, 640)).clip(0, 255).astype(np.uint8)
     noise[:, 300:306] = 220
     with serving(tmp_path) as server:

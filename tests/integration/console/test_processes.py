@@ -21,7 +21,7 @@ def told(root: int) -> dict[int, str]:
 
 
 @pytest.fixture
-def going(tmp_path: Path) -> Iterator[Going]:
+def going(tmp_path) -> Iterator[Going]:
     with console_of(tmp_path) as console:
         yield console
 
@@ -32,7 +32,7 @@ def going(tmp_path: Path) -> Iterator[Going]:
 ])  # fmt: skip
 def test_a_console_that_ends_takes_its_server_and_its_dry_run_along(
     going: Going, whom: str, number: signal.Signals, code: int
-) -> None:
+):
     browser = Browser(going.link())
     with browser.live() as page:
         key = json.loads(page.recv(timeout=20))["key"]

@@ -74,7 +74,7 @@ AWAY = HOME + np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 @pytest.mark.parametrize("kind", ["calibration", "verification", "timing", "commission", "homing", "jog"])
 @pytest.mark.parametrize("answer", ["confirm", "abort"])
-def test_a_protective_stop_is_asked_about_and_the_work_goes_on_or_ends(cell: Cell, kind: str, answer: str) -> None:
+def test_a_protective_stop_is_asked_about_and_the_work_goes_on_or_ends(cell: Cell, kind: str, answer: str):
     simulated(cell).devices.vehicle.brake()
     stop_on_the_way(cell)
     attempts: list[None] = []
@@ -103,7 +103,7 @@ def test_a_protective_stop_is_asked_about_and_the_work_goes_on_or_ends(cell: Cel
     assert not arm.moving
 
 
-def test_a_fault_that_is_met_again_and_again_ends_the_work(cell: Cell) -> None:
+def test_a_fault_that_is_met_again_and_again_ends_the_work(cell: Cell):
     simulated(cell).devices.vehicle.brake()
     stop_on_the_way(cell, 9)
     thread, ended = in_background(lambda: cell.home("arm"))
@@ -113,7 +113,7 @@ def test_a_fault_that_is_met_again_and_again_ends_the_work(cell: Cell) -> None:
     assert isinstance(ended[0], DeviceFault) and ended[0].code == "arm.protective_stop"
 
 
-def test_a_jog_that_was_stopped_goes_on_to_its_goal_and_no_further(cell: Cell) -> None:
+def test_a_jog_that_was_stopped_goes_on_to_its_goal_and_no_further(cell: Cell):
     before = simulated(cell).arm.model.drive.q[0]
     stop_on_the_way(cell)
     thread, ended = in_background(lambda: jog(cell, Jog("arm", "j1", math.radians(10.0))))
@@ -123,7 +123,7 @@ def test_a_jog_that_was_stopped_goes_on_to_its_goal_and_no_further(cell: Cell) -
     assert simulated(cell).arm.model.drive.q[0] - before == pytest.approx(math.radians(10.0), abs=1e-3)
 
 
-def test_manual_mode_asks_at_the_desk_takes_no_step_meanwhile_and_goes_on(cell: Cell) -> None:
+def test_manual_mode_asks_at_the_desk_takes_no_step_meanwhile_and_goes_on(cell: Cell):
     controller = ConsoleController(cell, "pot", lambda client, words: None)
     controller.holders.joined("c1")
     controller.do("c1", {"do": "hold", "name": "Ann"})
@@ -151,7 +151,7 @@ def test_manual_mode_asks_at_the_desk_takes_no_step_meanwhile_and_goes_on(cell: 
     controller.close()
 
 
-def test_an_arm_that_stopped_while_nothing_runs_is_unlocked_by_a_person_alone(cell: Cell) -> None:
+def test_an_arm_that_stopped_while_nothing_runs_is_unlocked_by_a_person_alone(cell: Cell):
     controller = ConsoleController(cell, "pot", lambda client, words: None)
     controller.holders.joined("c1")
     simulated(cell).fault("arm.protective_stop")
@@ -173,7 +173,7 @@ def test_an_arm_that_stopped_while_nothing_runs_is_unlocked_by_a_person_alone(ce
         cell.recover("Ann")
 
 
-def test_a_pendant_that_is_switched_to_local_refuses_the_next_motion_of_a_job(cell: Cell) -> None:
+def test_a_pendant_that_is_switched_to_local_refuses_the_next_motion_of_a_job(cell: Cell):
     """Connected in remote control: what was asked there holds for no later motion."""
     simulated(cell).devices.vehicle.brake()
     cell.home("arm")
@@ -184,9 +184,7 @@ def test_a_pendant_that_is_switched_to_local_refuses_the_next_motion_of_a_job(ce
     assert np.abs(simulated(cell).arm.model.drive.q - HOME).max() < 1e-3
 
 
-def test_a_job_whose_first_calibration_fails_ends_as_any_run(
-    cell: Cell, monkeypatch: pytest.MonkeyPatch, typed: Typed
-) -> None:
+def test_a_job_whose_first_calibration_fails_ends_as_any_run(cell: Cell, monkeypatch, typed: Typed):
     def refuse(*arguments: object) -> None:
         raise RefusedError("3 of 20 calibration views show the board")
 

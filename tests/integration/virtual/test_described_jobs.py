@@ -24,7 +24,7 @@ def require_placed(report: dict[str, Any]) -> None:
     assert truth["error_mm"]["d"]["mean"] / truth["bound_mm"] <= 1.5
 
 
-def test_one_job_after_another_in_one_world(calibrated_folder: Path) -> None:
+def test_one_job_after_another_in_one_world(calibrated_folder: Path):
     """The second has a surface of its own; the claw is filled again, and the vehicle stays where it sees the board."""
     cell, pot = described(calibrated_folder, LEAN, FAST)
     _, saddle = described(calibrated_folder / "saddle", None, SADDLE)
@@ -87,7 +87,7 @@ CELLS: dict[str, tuple[int, Changes, Changes]] = {
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("name", CELLS)
-def test_a_cell_that_is_described_otherwise_is_calibrated_and_places(name: str, tmp_path: Path) -> None:
+def test_a_cell_that_is_described_otherwise_is_calibrated_and_places(name: str, tmp_path):
     seed, config, job = CELLS[name]
     cell, own = described(tmp_path, config, job)
     write_saddle(tmp_path / "saddle.ply")

@@ -36,7 +36,7 @@ def rows(folder: Path) -> list[dict[str, object]]:
     return sorted(found, key=lambda row: str(row["seed"]))
 
 
-def test_one_and_two_workers_and_a_cluster_give_the_same_rows(tmp_path: Path) -> None:
+def test_one_and_two_workers_and_a_cluster_give_the_same_rows(tmp_path):
     pytest.importorskip("distributed")
     one = qualified(tmp_path, "--seeds", "2", "--workers", "1", "--out", "one")
     two = qualified(tmp_path, "--seeds", "2", "--workers", "2", "--out", "two")
@@ -47,7 +47,7 @@ def test_one_and_two_workers_and_a_cluster_give_the_same_rows(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_what_is_killed_goes_on_and_leaves_no_process(tmp_path: Path, number: int) -> None:
+def test_what_is_killed_goes_on_and_leaves_no_process(tmp_path, number: int):
     store = RowStore(tmp_path / "out")
     going = begin(tmp_path, "--seeds", "3", "--workers", "2", "--out", "out")
     assert until(lambda: store.rows(), 300.0)

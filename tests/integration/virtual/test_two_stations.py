@@ -16,7 +16,7 @@ from tests.support.described_cells import UNDRAWN, described, quick_job
 
 def test_a_part_is_placed_at_each_stop_also_when_the_second_run_was_cut_short(
     placed_pot: JobRecord, calibrated_folder: Path
-) -> None:
+):
     fast, told = quick_job("two-stations", calibrated_folder), list[str]()
     cell_file, _ = described(calibrated_folder, UNDRAWN)
     with Cell.open(cell_file, sim="all", seed=placed_pot.seed, clock="virtual", job=fast) as cell:

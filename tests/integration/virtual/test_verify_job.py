@@ -11,9 +11,7 @@ from drivers.errors import CalibrationStale
 from tests.support import Typed
 
 
-def test_verify_tells_a_disturbed_calibration_from_a_good_one(
-    calibrated_folder: Path, monkeypatch: pytest.MonkeyPatch, typed: Typed
-) -> None:
+def test_verify_tells_a_disturbed_calibration_from_a_good_one(calibrated_folder: Path, monkeypatch, typed: Typed):
     (file,) = (calibrated_folder / "calibrations").glob("*.json")
     monkeypatch.setattr(Cell, "open", partial(Cell.open, clock="virtual"))
     verify = ("calibrate", "verify", "--sim", "all", "--seed", "2", "--json")
@@ -40,7 +38,7 @@ def test_verify_tells_a_disturbed_calibration_from_a_good_one(
 
 @pytest.mark.campaign
 @pytest.mark.usefixtures("here")
-def test_cells_that_nobody_touched_are_called_good() -> None:
+def test_cells_that_nobody_touched_are_called_good():
     alarms, alarmed, changes = 0, 0, 0
     for seed in range(1, 21):
         with Cell.open(sim="all", seed=seed, clock="virtual") as cell:

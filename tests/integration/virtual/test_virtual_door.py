@@ -64,7 +64,7 @@ def plain_record(folder: Path) -> list[Any]:
     return [(m.topic, m.at, m.schema, m.data) for m in said(folder / "record.mcap", Parts())]
 
 
-def test_the_same_seed_gives_the_same_bytes_through_a_fault_and_its_recovery() -> None:
+def test_the_same_seed_gives_the_same_bytes_through_a_fault_and_its_recovery():
     """Whether pictures are looked at on one core or on more."""
     Path("cell.toml").unlink()
     first = done((STOP,), confirm="simulated")
@@ -89,7 +89,7 @@ def test_the_same_seed_gives_the_same_bytes_through_a_fault_and_its_recovery() -
     assert report["truth"]["error_mm"]["d"]["mean"] < 3 * report["truth"]["bound_mm"]
 
 
-def test_a_vehicle_that_was_moved_in_a_fault_is_not_swept_from_where_it_stood() -> None:
+def test_a_vehicle_that_was_moved_in_a_fault_is_not_swept_from_where_it_stood():
     with opened(confirm="simulated") as cell:
 
         def push(event: Event) -> None:
@@ -105,7 +105,7 @@ def test_a_vehicle_that_was_moved_in_a_fault_is_not_swept_from_where_it_stood() 
     assert re.search(r"the board has moved by \d+\.\d+ mm .* since it was photographed", outcome.reason)
 
 
-def test_a_script_that_allows_one_decision_is_asked_once() -> None:
+def test_a_script_that_allows_one_decision_is_asked_once():
     asked: list[str] = []
 
     def refuse(_: object) -> None:
@@ -121,7 +121,7 @@ def test_a_script_that_allows_one_decision_is_asked_once() -> None:
     assert asked == ["drive_to_target"]
 
 
-def test_a_rail_that_is_reset_is_homed_and_sweeps_again() -> None:
+def test_a_rail_that_is_reset_is_homed_and_sweeps_again():
     outcome = done(("rail.reset@laser_sweep:40%",), until="reconstruct")
     assert outcome.outcome == "done"
     sweep = outcome.report["steps"][2]
@@ -141,14 +141,14 @@ def test_a_rail_that_is_reset_is_homed_and_sweeps_again() -> None:
         ("rail.lost_steps@place:2%", "rail.lost_steps"),
     ],
 )
-def test_a_fault_that_no_program_may_clear_ends_the_run_and_leaves_the_cell_safe(inject: str, code: str) -> None:
+def test_a_fault_that_no_program_may_clear_ends_the_run_and_leaves_the_cell_safe(inject: str, code: str):
     outcome = done((inject,), confirm="simulated")
     assert (outcome.outcome, outcome.report["code"]) == ("faulted", code)
     assert outcome.reason.startswith(inject.partition(".")[0])
     require_safe(dict(outcome.report))
 
 
-def test_a_drive_that_is_done_again_in_vain_does_not_look_at_the_fine_board_again() -> None:
+def test_a_drive_that_is_done_again_in_vain_does_not_look_at_the_fine_board_again():
     """The vehicle may stand before a station that the arm does not know yet."""
     Path("cell.toml").unlink()
     outcome = done(("target_camera.silent@drive_to_target",), confirm="simulated")
@@ -160,7 +160,7 @@ def test_a_drive_that_is_done_again_in_vain_does_not_look_at_the_fine_board_agai
     assert len(list((outcome.folder / "frames").glob("interim-1-*.png"))) == 1
 
 
-def test_a_script_between_the_steps_may_move_what_the_run_may_and_a_stop_before_the_run_is_not_forgotten() -> None:
+def test_a_script_between_the_steps_may_move_what_the_run_may_and_a_stop_before_the_run_is_not_forgotten():
     with opened() as cell:
         rail, moved = cell.devices.rail, []
 
@@ -180,7 +180,7 @@ def test_a_script_between_the_steps_may_move_what_the_run_may_and_a_stop_before_
 
 
 @pytest.mark.parametrize("name", ["arm.late_states", "rail.drop_reply", "rail.late_reply", "can.bus_off"])
-def test_a_fault_of_a_wire_is_refused_where_there_is_none(name: str) -> None:
+def test_a_fault_of_a_wire_is_refused_where_there_is_none(name: str):
     with opened() as cell, pytest.raises(ConfigError, match=r"fault of the wire.*use --clock wall"):
         cell.start("pot.toml", inject=[f"{name}@laser_sweep"])
 
@@ -190,7 +190,7 @@ def upto(run: Run[RunOutcome], kind: type[RunEvent], step: str | None = None) ->
     return next(event for event in run.events() if isinstance(event, kind) and step in (None, event.step))
 
 
-def test_a_protective_stop_waits_for_a_persons_word() -> None:
+def test_a_protective_stop_waits_for_a_persons_word():
     with opened() as cell:
         run = cell.start("pot.toml", inject=["arm.protective_stop@drive_to_target:10%"], until="drive_to_target")
         needed = upto(run, ConfirmNeeded)
@@ -207,7 +207,7 @@ def test_a_protective_stop_waits_for_a_persons_word() -> None:
 
 
 @pytest.mark.parametrize("button", ["arm", "vehicle"])
-def test_an_emergency_stop_ends_a_run_that_waits_for_a_persons_word(button: str) -> None:
+def test_an_emergency_stop_ends_a_run_that_waits_for_a_persons_word(button: str):
     with opened() as cell:
         run = cell.start("pot.toml", inject=["arm.protective_stop@drive_to_target:10%"])
         upto(run, ConfirmNeeded)
@@ -217,7 +217,7 @@ def test_an_emergency_stop_ends_a_run_that_waits_for_a_persons_word(button: str)
     assert [fault["code"] for fault in outcome.report["faults"]] == [f"{button}.emergency_stop"]
 
 
-def test_without_a_word_the_run_waits_and_can_be_ended() -> None:
+def test_without_a_word_the_run_waits_and_can_be_ended():
     with opened() as cell:
         run = cell.start("pot.toml", inject=["arm.protective_stop@drive_to_target:10%"])
         upto(run, ConfirmNeeded)
@@ -240,7 +240,7 @@ def test_without_a_word_the_run_waits_and_can_be_ended() -> None:
         ("close", "drive_to_target", "closed"),
     ],
 )
-def test_who_ends_a_run_from_outside_finds_the_cell_safe(way: str, step: str, reason: str) -> None:
+def test_who_ends_a_run_from_outside_finds_the_cell_safe(way: str, step: str, reason: str):
     with opened() as cell:
         run = cell.start("pot.toml")
         upto(run, StepStarted, step)
@@ -266,7 +266,7 @@ def test_who_ends_a_run_from_outside_finds_the_cell_safe(way: str, step: str, re
     require_safe(dict(outcome.report))
 
 
-def test_a_stop_after_a_good_end_is_kept_and_the_next_job_is_not_begun() -> None:
+def test_a_stop_after_a_good_end_is_kept_and_the_next_job_is_not_begun():
     with opened() as cell:
         run = cell.start("pot.toml", until="drive_to_target")
         for event in run.events():
@@ -285,7 +285,7 @@ def test_a_stop_after_a_good_end_is_kept_and_the_next_job_is_not_begun() -> None
         assert (again.outcome, again.stopped_after_end) == ("done", False)
 
 
-def test_a_paused_run_stands_until_it_goes_on() -> None:
+def test_a_paused_run_stands_until_it_goes_on():
     with opened() as cell:
         run = cell.start("pot.toml", until="drive_to_target")
         upto(run, StepStarted)
@@ -300,7 +300,7 @@ def test_a_paused_run_stands_until_it_goes_on() -> None:
         assert run.result(60.0).outcome == "done"
 
 
-def test_an_aborted_run_is_resumed_through_the_same_door_and_ends_where_it_was_to_end(typed: Typed) -> None:
+def test_an_aborted_run_is_resumed_through_the_same_door_and_ends_where_it_was_to_end(typed: Typed):
     with opened() as cell:
         cell.pace = 0.5
         run = cell.start("pot.toml", until="board_photo")
@@ -316,7 +316,7 @@ def test_an_aborted_run_is_resumed_through_the_same_door_and_ends_where_it_was_t
         cell.resume(cell.runs_folder / report["run"])
 
 
-def test_a_run_that_a_script_looked_at_is_resumed_with_a_script_only() -> None:
+def test_a_run_that_a_script_looked_at_is_resumed_with_a_script_only():
     def abort(result: object) -> None:
         raise Aborted("to be resumed")
 
@@ -329,14 +329,14 @@ def test_a_run_that_a_script_looked_at_is_resumed_with_a_script_only() -> None:
         assert cell.resume(aborted.folder, script=script).outcome == "aborted"
 
 
-def test_the_command_line_says_what_time_passed_here_and_there(typed: Typed) -> None:
+def test_the_command_line_says_what_time_passed_here_and_there(typed: Typed):
     virtual = ("dry-run", "-j", "pot.toml", "--clock", "virtual", "--seed", str(SEED), "--until", "drive_to_target")
     code, out, _ = typed(*virtual)
     assert code == 0 and re.search(r"whole run +\d+\.\d\d s +\d+\.\d\d s", out)
     assert typed(*virtual, "--speed", "2")[0] == 2
 
 
-def test_a_run_goes_at_the_pace_that_was_set(tmp_path: Path) -> None:
+def test_a_run_goes_at_the_pace_that_was_set(tmp_path):
     # How often a job looks at the fine board is chance.
     unlooked = tmp_path / "cell.toml"
     unlooked.write_text(default_toml().replace("each_job = true", "each_job = false"))

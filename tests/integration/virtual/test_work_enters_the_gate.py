@@ -1,7 +1,6 @@
 """Every step of a job works behind the gate, with the token that ends it."""
 
 import math
-from pathlib import Path
 
 import pytest
 
@@ -29,7 +28,7 @@ class AtTheGate(StepContext):
         self._gate.require()
 
 
-def test_every_step_enters_the_gate_with_the_token_that_ends_it(tmp_path: Path) -> None:
+def test_every_step_enters_the_gate_with_the_token_that_ends_it(tmp_path):
     config = load_config(None)
     job, mesh = load_job("pot")
     cell = VirtualCell(config, 1)

@@ -147,7 +147,7 @@ WRONG_CONFIGURATIONS: list[tuple[str, str | None, tuple[str, ...]]] = [
 @pytest.mark.parametrize(("key", "value", "words"), WRONG_CONFIGURATIONS)
 def test_a_wrong_configuration_does_not_pass_the_check(
     typed: Typed, place: Path, key: str, value: str | None, words: tuple[str, ...]
-) -> None:
+):
     (place / "cell.toml").write_text(changed(default_toml(), key, value))
     (place / "pot.toml").write_text(job_path("pot").read_text())
     assert_refused(typed("check"), words)
@@ -216,7 +216,7 @@ WRONG_JOBS: list[tuple[str, str | None, tuple[str, ...]]] = [
 @pytest.mark.parametrize(("key", "value", "words"), WRONG_JOBS)
 def test_a_wrong_job_does_not_pass_the_check(
     typed: Typed, place: Path, key: str, value: str | None, words: tuple[str, ...]
-) -> None:
+):
     (place / "text.stl").write_text("this is no mesh\n" * 40)
     (place / "empty.stl").write_bytes(b"")
     write_mesh(place / "nan.stl", height=float("nan"))
@@ -227,7 +227,7 @@ def test_a_wrong_job_does_not_pass_the_check(
     assert_refused(typed("check", "-j", "pot.toml"), words)
 
 
-def test_times_that_no_step_has_are_refused(typed: Typed, place: Path) -> None:
+def test_times_that_no_step_has_are_refused(typed: Typed, place: Path):
     slow = changed(job_path("pot").read_text(), "place.speed", '"2 mm/s"')
     (place / "pot.toml").write_text(changed(slow, "place.approach", '"500 mm"'))
     assert_refused(typed("check"), ("place.approach", "502 s", "at most 150 s"))
@@ -236,7 +236,7 @@ def test_times_that_no_step_has_are_refused(typed: Typed, place: Path) -> None:
     assert_refused(typed("check"), ("the way of 5.00 m", "250 s", "raise approach.speed"))
 
 
-def test_all_that_is_wrong_is_told_at_once_and_as_json(typed: Typed, place: Path) -> None:
+def test_all_that_is_wrong_is_told_at_once_and_as_json(typed: Typed, place: Path):
     text = changed(changed(default_toml(), "rail.lead", "2"), "laser.output", "18")
     (place / "cell.toml").write_text(text)
     code, shown, _ = typed("check", "--json")
@@ -284,14 +284,14 @@ RIGHT_JOBS = [
     ("file", "key", "value"),
     [("cell.toml", *each) for each in RIGHT_CONFIGURATIONS] + [("pot.toml", *each) for each in RIGHT_JOBS],
 )
-def test_right_values_pass(typed: Typed, place: Path, file: str, key: str, value: str) -> None:
+def test_right_values_pass(typed: Typed, place: Path, file: str, key: str, value: str):
     for name, text in (("cell.toml", default_toml()), ("pot.toml", job_path("pot").read_text())):
         (place / name).write_text(changed(text, key, value) if name == file else text)
     code, out, error = typed("check")
     assert code == 0, out + error
 
 
-def test_a_mesh_in_millimetres_passes_with_its_unit(typed: Typed, place: Path) -> None:
+def test_a_mesh_in_millimetres_passes_with_its_unit(typed: Typed, place: Path):
     write_mesh(place / "pot.ply", (70.0, 36.0), 8.0)
     (place / "pot.toml").write_text(changed(job_path("pot").read_text(), "surface.mesh_unit", '"mm"'))
     assert typed("check")[0] == 0
@@ -307,9 +307,7 @@ def test_a_mesh_in_millimetres_passes_with_its_unit(typed: Typed, place: Path) -
     ],
 )
 @pytest.mark.parametrize("option", ["-c", "-j"])
-def test_a_file_that_is_none_is_refused(
-    typed: Typed, place: Path, option: str, content: bytes, words: tuple[str, ...]
-) -> None:
+def test_a_file_that_is_none_is_refused(typed: Typed, place: Path, option: str, content: bytes, words: tuple[str, ...]):
     (place / "wrong.toml").write_bytes(content)
     assert_refused(typed("check", option, "wrong.toml"), words)
 
@@ -363,5 +361,5 @@ def test_a_file_that_is_none_is_refused(
         (("check", "--colour"), ("No such option",)),
     ],
 )
-def test_a_wrong_command_line_is_refused(typed: Typed, words: tuple[str, ...], shown: tuple[str, ...]) -> None:
+def test_a_wrong_command_line_is_refused(typed: Typed, words: tuple[str, ...], shown: tuple[str, ...]):
     assert_refused(typed(*words), shown)

@@ -13,7 +13,7 @@ from tests.support.wire.cells import Supervised
 
 
 @pytest.fixture(scope="session")
-def supervised(tmp_path_factory: pytest.TempPathFactory) -> Supervised:
+def supervised(tmp_path_factory) -> Supervised:
     """The script that the README prints, over the wires, where the cell of seed 3 was calibrated without wires."""
     folder = tmp_path_factory.mktemp("cell")
     with pytest.MonkeyPatch.context() as patch:

@@ -80,7 +80,7 @@ def serving(*arguments: str) -> Any:
     """A fixture for a test file: a folder with the configuration of a cell served for it, `sim.toml`; its endpoints."""
 
     @pytest.fixture(scope="module")
-    def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, dict[str, Any]]]:
+    def made(tmp_path_factory) -> Iterator[tuple[Path, dict[str, Any]]]:
         folder = tmp_path_factory.mktemp("cell")
         with served(folder, *arguments) as endpoints:
             yield folder, endpoints

@@ -35,7 +35,7 @@ MAKE = Make("{kind}", "other", OtherConfig, BUILT_IN[{k}].connect, {more})
 
 
 @pytest.fixture
-def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def site(tmp_path, monkeypatch) -> Path:
     """Where packages are installed: a folder on this program's path, outside the repository."""
     folder = tmp_path / "site"
     install(folder, "acme-rail", "1.2", "rail.acme = acme_rail:MAKE", acme_rail=RAIL)
@@ -50,7 +50,7 @@ def loaded(folder: Path, **changes: str) -> CellConfig:
     return load_config(path)
 
 
-def test_every_kind_has_a_built_in_make_which_is_taken_when_none_is_named(tmp_path: Path) -> None:
+def test_every_kind_has_a_built_in_make_which_is_taken_when_none_is_named(tmp_path):
     assert {make.kind for make in BUILT_IN} == set(KINDS)
     path = tmp_path / "cell.toml"
     path.write_text("\n".join(line for line in default_toml().splitlines() if not line.startswith("driver")))
@@ -59,11 +59,11 @@ def test_every_kind_has_a_built_in_make_which_is_taken_when_none_is_named(tmp_pa
     assert config == load_config(None)
 
 
-def test_a_calibration_made_before_there_were_makes_still_fits() -> None:
+def test_a_calibration_made_before_there_were_makes_still_fits():
     assert load_config(None).calibration_hash() == "3bf8e26c4fda6b11"
 
 
-def test_a_package_outside_brings_a_make_that_a_configuration_can_name(site: Path, tmp_path: Path) -> None:
+def test_a_package_outside_brings_a_make_that_a_configuration_can_name(site: Path, tmp_path):
     config = loaded(tmp_path)
     rail: Rail = connect_one(config, "rail", Clock())
     assert rail.identity().model == "Acme belt rail"
@@ -74,7 +74,7 @@ def test_a_package_outside_brings_a_make_that_a_configuration_can_name(site: Pat
     assert [row.source for row in installed() if row.make == "acme"] == ["acme-rail 1.2"]
 
 
-def test_what_a_calibration_depends_on_comes_from_the_make(site: Path, tmp_path: Path) -> None:
+def test_what_a_calibration_depends_on_comes_from_the_make(site: Path, tmp_path):
     own = loaded(tmp_path).calibration_hash()
     assert own != load_config(None).calibration_hash()
     assert loaded(tmp_path, port="/dev/acme1").calibration_hash() == own
@@ -90,8 +90,8 @@ def test_what_a_calibration_depends_on_comes_from_the_make(site: Path, tmp_path:
     ],
 )
 def test_a_calibration_of_one_make_does_not_fit_another_with_the_same_values(
-    site: Path, tmp_path: Path, kind: str, k: int, module: str, record: str, more: str
-) -> None:
+    site: Path, tmp_path, kind: str, k: int, module: str, record: str, more: str
+):
     text = OTHER.format(kind=kind, k=k, module=module, record=record, more=more)
     install(site, "other", "1.0", f"{kind}.other = other_{kind}:MAKE", **{f"other_{kind}": text})
     before, table, after = default_toml().partition(f"\n[{kind}]")
@@ -104,14 +104,14 @@ def test_a_calibration_of_one_make_does_not_fit_another_with_the_same_values(
     assert safe_off_outputs(other) == (own.laser.output,)
 
 
-def test_its_values_are_checked_as_those_of_the_built_in_ones(site: Path, tmp_path: Path) -> None:
+def test_its_values_are_checked_as_those_of_the_built_in_ones(site: Path, tmp_path):
     with pytest.raises(ConfigError, match=r"rail\.belt: .*1 to 10 mm"):
         loaded(tmp_path, belt="30 mm")
     with pytest.raises(ConfigError, match=r'rail\.port and vehicle\.channel are both "/dev/ttyUSB0"'):
         loaded(tmp_path, port="/dev/ttyUSB0")
 
 
-def test_a_make_that_nothing_simulates_is_refused_in_a_simulated_cell(site: Path, tmp_path: Path) -> None:
+def test_a_make_that_nothing_simulates_is_refused_in_a_simulated_cell(site: Path, tmp_path):
     with pytest.raises(ConfigError, match=r'rail\.driver = "acme": nothing simulates this make'):
         with_endpoints(loaded(tmp_path), {"speed": 1.0, "truth": {"address": "127.0.0.1:1"}, "arm": {"address": "x"}})
 
@@ -129,9 +129,7 @@ def test_a_make_that_nothing_simulates_is_refused_in_a_simulated_cell(site: Path
     ],
     ids=["import", "exit", "no make", "another name", "another record", "unknown key", "on the arm"],
 )
-def test_a_broken_package_is_listed_with_its_error_and_stops_nothing(
-    site: Path, tmp_path: Path, module: str, words: str
-) -> None:
+def test_a_broken_package_is_listed_with_its_error_and_stops_nothing(site: Path, tmp_path, module: str, words: str):
     (site / "acme_rail.py").write_text(module)
     rows = {(row.kind, row.make): row for row in installed()}
     assert rows["rail", "acme"].state.startswith("broken: ")
@@ -144,7 +142,7 @@ def test_a_broken_package_is_listed_with_its_error_and_stops_nothing(
     assert "rail.driver" in str(caught.value) and words in str(caught.value)
 
 
-def test_a_package_cannot_take_the_name_of_a_built_in_make(site: Path) -> None:
+def test_a_package_cannot_take_the_name_of_a_built_in_make(site: Path):
     install(site, "evil-rail", "6.6", "rail.tmcl = evil_rail:MAKE", evil_rail="raise SystemExit('was imported')")
     found = [row for row in installed() if row.make == "tmcl"]
     assert [(row.source, row.state.partition(":")[0]) for row in found] == [
@@ -154,7 +152,7 @@ def test_a_package_cannot_take_the_name_of_a_built_in_make(site: Path) -> None:
     assert type(load_config(None).rail) is TmclRailConfig
 
 
-def test_of_two_packages_with_one_name_neither_is_taken(site: Path, tmp_path: Path) -> None:
+def test_of_two_packages_with_one_name_neither_is_taken(site: Path, tmp_path):
     install(site, "other-rail", "0.1", "rail.acme = other_rail:MAKE", other_rail=RAIL)
     assert {row.source: row.state for row in installed() if row.make == "acme"} == {
         "acme-rail 1.2": "refused: other-rail 0.1 brings a make of this name as well",
@@ -164,14 +162,14 @@ def test_of_two_packages_with_one_name_neither_is_taken(site: Path, tmp_path: Pa
         loaded(tmp_path)
 
 
-def test_an_unknown_driver_is_refused_with_what_is_installed(site: Path, tmp_path: Path) -> None:
+def test_an_unknown_driver_is_refused_with_what_is_installed(site: Path, tmp_path):
     path = tmp_path / "cell.toml"
     path.write_text(default_toml().replace('driver = "tmcl"', 'driver = "plc"'))
     with pytest.raises(ConfigError, match=r'rail\.driver: "plc" is not one of "tmcl" or "modbus" or "acme"'):
         load_config(path)
 
 
-def test_the_command_lists_what_is_installed_with_its_source(site: Path, tmp_path: Path) -> None:
+def test_the_command_lists_what_is_installed_with_its_source(site: Path, tmp_path):
     install(site, "lost", "0.0.1", "camera = lost:MAKE\nsonar.ping = lost:MAKE", lost="")
     path = os.pathsep.join((str(site), *sys.path))
     done = subprocess.run(
@@ -218,7 +216,7 @@ MAKE = Make("arm", "old", OldArmConfig, lambda name, config, around: OldArm(name
 """An arm that was written before arms told their kinematics."""
 
 
-def test_an_arm_that_lacks_a_method_is_named_with_it_and_closed(site: Path, tmp_path: Path) -> None:
+def test_an_arm_that_lacks_a_method_is_named_with_it_and_closed(site: Path, tmp_path):
     install(site, "old-arm", "0.9", "arm.old = old_arm:MAKE", old_arm=ARM)
     path = tmp_path / "old.toml"
     path.write_text(default_toml().replace('driver = "ur"', 'driver = "old"'))

@@ -14,7 +14,7 @@ def latch(host: float, ahead: float, half: float) -> Latch:
 
 
 @pytest.mark.parametrize("jump", [-900.0, -0.02, 0.02, 900.0])
-def test_a_clock_that_was_set_is_read_by_what_it_told_since(jump: float) -> None:
+def test_a_clock_that_was_set_is_read_by_what_it_told_since(jump: float):
     """The earlier latches have the shorter round trips: they alone must not decide."""
     clocks = ClockMap()
     for host in range(0, 100, 10):
@@ -25,7 +25,7 @@ def test_a_clock_that_was_set_is_read_by_what_it_told_since(jump: float) -> None
     assert clocks.bound_at(101.0) == pytest.approx(200e-6 + MAX_DRIFT, rel=1e-6)
 
 
-def test_a_clock_that_runs_on_keeps_what_was_learned_of_it() -> None:
+def test_a_clock_that_runs_on_keeps_what_was_learned_of_it():
     clocks = ClockMap()
     for host, half in ((0.0, 50e-6), (60.0, 50e-6), (120.0, 400e-6), (180.0, 3e-3)):
         clocks.add([latch(host, 5.0, half)])
@@ -33,7 +33,7 @@ def test_a_clock_that_runs_on_keeps_what_was_learned_of_it() -> None:
     assert clocks.uncertainty < 2e-3
 
 
-def test_the_shortest_of_several_round_trips_counts() -> None:
+def test_the_shortest_of_several_round_trips_counts():
     exact, late = latch(10.0, 5.0, 20e-6), Latch(10.0, 10.0 + 5.0 + 10.0 * 20e-6, 10.4)
     for order in ([exact, late], [late, exact]):
         clocks = ClockMap()
@@ -42,7 +42,7 @@ def test_the_shortest_of_several_round_trips_counts() -> None:
         assert clocks.bound_at(10.0) == pytest.approx(20e-6)
 
 
-def test_the_bound_holds_a_clock_that_drifts_before_and_after_its_latches() -> None:
+def test_the_bound_holds_a_clock_that_drifts_before_and_after_its_latches():
     """Also long after them, where what is not known of the drift is more than the round trips."""
     clocks = ClockMap()
     for host in (0.0, 10.0):
@@ -53,20 +53,20 @@ def test_the_bound_holds_a_clock_that_drifts_before_and_after_its_latches() -> N
     assert clocks.bound_at(200.0) > clocks.bound_at(20.0) > clocks.bound_at(10.0)
 
 
-def test_a_wait_without_end_ends_with_the_event() -> None:
+def test_a_wait_without_end_ends_with_the_event():
     over = threading.Event()
     threading.Timer(0.02, over.set).start()
     assert Clock().wait(over, math.inf)
 
 
-def test_a_drift_that_is_known_carries_far() -> None:
+def test_a_drift_that_is_known_carries_far():
     clocks = ClockMap()
     for host in (0.0, 1000.0):
         clocks.add([latch(host, 5.0, 50e-6)])
     assert clocks.host_time(latch(2000.0, 5.0, 0.0).device) == pytest.approx(2000.0, abs=0.5e-3)
 
 
-def test_the_bound_holds_for_a_crystal_that_warms_up() -> None:
+def test_the_bound_holds_for_a_crystal_that_warms_up():
     """By 10 ppm within 10 min, latched each half minute, mostly with a longer round trip; also 20 s after a latch."""
     clocks = ClockMap()
     for host in range(0, 3600, 30):

@@ -11,20 +11,20 @@ def silent() -> None:
     raise DeadlineError("camera", "no answer to 'stop'")
 
 
-def test_the_first_error_goes_on_and_tells_of_the_second() -> None:
+def test_the_first_error_goes_on_and_tells_of_the_second():
     with pytest.raises(DeviceFault) as caught, in_the_end(silent):
         raise FAULT
     assert caught.value is FAULT
     assert "no answer to 'stop'" in "".join(caught.value.__notes__)
 
 
-def test_an_end_that_fails_after_work_that_went_well_is_an_error() -> None:
+def test_an_end_that_fails_after_work_that_went_well_is_an_error():
     with pytest.raises(DeadlineError), in_the_end(silent):
         pass
 
 
 @pytest.mark.parametrize("error", [None, InterlockError("rail", "no"), KeyboardInterrupt()])
-def test_the_end_comes_once_whatever_happened(error: BaseException | None) -> None:
+def test_the_end_comes_once_whatever_happened(error: BaseException | None):
     done: list[str] = []
     try:
         with in_the_end(lambda: done.append("off")):

@@ -104,7 +104,7 @@ serving = cells.serving("--seed", "3", "--speed", "1")
 )  # fmt: skip
 def test_half_a_second_after_the_last_sign_of_life_all_is_safe(
     serving: tuple[Path, dict[str, Any]], how: signal.Signals, script: str, moving: Callable[[Truth], bool]
-) -> None:
+):
     folder, endpoints = serving
     # Someone may have been killed here before: nothing may be on its way already.
     assert not moving(ask(endpoints, op="truth")["truth"])

@@ -28,7 +28,7 @@ thread.join()
 print(before == os.SCHED_RR, os.sched_getscheduler(0) == os.SCHED_OTHER)"""
 
 
-def test_what_spins_in_real_time_loses_the_right_to_it() -> None:
+def test_what_spins_in_real_time_loses_the_right_to_it():
     done = subprocess.run([sys.executable, "-c", SPIN], capture_output=True, text=True, timeout=30.0, check=True)
     raised, lowered = done.stdout.split()
     if raised == "False":
@@ -36,7 +36,7 @@ def test_what_spins_in_real_time_loses_the_right_to_it() -> None:
     assert lowered == "True"
 
 
-def test_an_owner_that_waits_for_a_processor_is_late_one_that_was_stopped_is_frozen() -> None:
+def test_an_owner_that_waits_for_a_processor_is_late_one_that_was_stopped_is_frozen():
     """On one core, beside a process that goes first."""
     spin = [sys.executable, "-c", "while True: pass"]
     core = min(os.sched_getaffinity(0))

@@ -18,7 +18,7 @@ from tests.unit.cell.devices.contracts.test_device import Direct
 
 
 @pytest.mark.parametrize("tables", [(MODBUS,), (NUMATO,), (LCUS, ROBOTIQ), (MODBUS, NUMATO, ROBOTIQ)])
-def test_what_the_document_prints_is_a_cell_that_is_simulated_as_it_is_described(tables: tuple[dict[str, Any]]) -> None:
+def test_what_the_document_prints_is_a_cell_that_is_simulated_as_it_is_described(tables: tuple[dict[str, Any]]):
     """The drawing goes through its text, as it does to the serving process, and every device has its peer."""
     config = cell(*tables)
     drawing = Described.of("pot").drawing(config)
@@ -32,7 +32,7 @@ def test_what_the_document_prints_is_a_cell_that_is_simulated_as_it_is_described
         peer.stop()
 
 
-def test_no_output_of_the_arm_belongs_to_a_laser_on_a_board() -> None:
+def test_no_output_of_the_arm_belongs_to_a_laser_on_a_board():
     assert safe_off_outputs(cell(LCUS)) == ()
     assert [make.name for make in BUILT_IN if make.kind == "claw"] == ["arm_output", "numato", "robotiq"]
 
@@ -44,9 +44,7 @@ def test_no_output_of_the_arm_belongs_to_a_laser_on_a_board() -> None:
         (({"claw": {**ROBOTIQ["claw"], "address": "192.0.2.10"}},), "has no port; write HOST:PORT"),
     ],
 )  # fmt: skip
-def test_a_wrong_table_is_refused_with_key_value_and_what_is_allowed(
-    tables: tuple[dict[str, Any], ...], told: str
-) -> None:
+def test_a_wrong_table_is_refused_with_key_value_and_what_is_allowed(tables: tuple[dict[str, Any], ...], told: str):
     with pytest.raises(ConfigError) as met:
         cell(*tables)
     assert told in str(met.value)

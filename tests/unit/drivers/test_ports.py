@@ -8,7 +8,7 @@ import pytest
 from drivers.ports import SocketPort, open_port
 
 
-def test_a_port_over_a_network_closes_at_once_and_is_opened_again_when_its_server_had_time() -> None:
+def test_a_port_over_a_network_closes_at_once_and_is_opened_again_when_its_server_had_time():
     with socket.create_server(("127.0.0.1", 0)) as server, socket.create_server(("127.0.0.1", 0)) as other:
         first, second = (f"socket://127.0.0.1:{each.getsockname()[1]}" for each in (server, other))
         port = open_port("rail", first, baud=9600, timeout=1.0)
@@ -27,6 +27,6 @@ def test_a_port_over_a_network_closes_at_once_and_is_opened_again_when_its_serve
             again.read(1)
 
 
-def test_a_port_that_no_helper_can_hold_is_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_port_that_no_helper_can_hold_is_told(caplog):
     open_port("laser", "loop://", baud=9600, timeout=0.1).close()
     assert "laser: nobody will stop it if this process is killed: port loop://" in caplog.text

@@ -46,7 +46,7 @@ def arm() -> BenchArm:
     return BenchArm()
 
 
-def test_the_laser_is_on_inside_its_context_only(arm: BenchArm) -> None:
+def test_the_laser_is_on_inside_its_context_only(arm: BenchArm):
     laser = ArmSwitchedLaser("laser", arm, 3)
     with laser.lit():
         assert arm.outputs == 0b1000
@@ -55,7 +55,7 @@ def test_the_laser_is_on_inside_its_context_only(arm: BenchArm) -> None:
     assert not laser.is_on
 
 
-def test_an_output_that_somebody_else_has_set_is_not_taken_over(arm: BenchArm) -> None:
+def test_an_output_that_somebody_else_has_set_is_not_taken_over(arm: BenchArm):
     arm.set_digital_output(0, True)
     laser = ArmSwitchedLaser("laser", arm, 0)
     with pytest.raises(InterlockError, match="stop"), laser.lit():
@@ -66,7 +66,7 @@ def test_an_output_that_somebody_else_has_set_is_not_taken_over(arm: BenchArm) -
         assert laser.is_on
 
 
-def test_stop_and_close_switch_the_laser_off_over_its_owners_head(arm: BenchArm) -> None:
+def test_stop_and_close_switch_the_laser_off_over_its_owners_head(arm: BenchArm):
     laser = ArmSwitchedLaser("laser", arm, 0)
     with laser.lit():
         laser.stop()
@@ -76,7 +76,7 @@ def test_stop_and_close_switch_the_laser_off_over_its_owners_head(arm: BenchArm)
         assert not laser.is_on
 
 
-def test_closing_on_nothing_and_a_part_that_sticks_are_faults(arm: BenchArm) -> None:
+def test_closing_on_nothing_and_a_part_that_sticks_are_faults(arm: BenchArm):
     claw = ArmSwitchedClaw("claw", arm, 1, 2, clock=Clock(100.0))
     with pytest.raises(DeviceFault, match="does not show a held part") as caught:
         claw.grip()

@@ -60,7 +60,7 @@ def served(pair: tuple[Served, Served]) -> Served:
     return pair[0]
 
 
-def test_two_cells_share_no_endpoint_and_no_world(pair: tuple[Served, Served]) -> None:
+def test_two_cells_share_no_endpoint_and_no_world(pair: tuple[Served, Served]):
     a, b = (served.endpoints for served in pair)
     for device in ("arm", "rail", "vehicle", "scan_camera", "target_camera", "truth"):
         assert set(a[device].values()) - {"slcan"} != set(b[device].values()) - {"slcan"}, device
@@ -70,7 +70,7 @@ def test_two_cells_share_no_endpoint_and_no_world(pair: tuple[Served, Served]) -
     assert truths[0]["poses"]["world_from_surface"] != truths[1]["poses"]["world_from_surface"]
 
 
-def test_faults_are_caused_and_taken_away_over_the_truth_endpoint(served: Served) -> None:
+def test_faults_are_caused_and_taken_away_over_the_truth_endpoint(served: Served):
     assert served.ask_truth(op="fault", name="arm.protective_stop")["ok"]
     assert served.ask_truth(op="truth")["truth"]["arm"]["safety"] == "protective_stop"
     assert served.ask_truth(op="reset")["ok"]
@@ -92,9 +92,7 @@ def test_faults_are_caused_and_taken_away_over_the_truth_endpoint(served: Served
         (["--seed", "-3"], "0 or greater"),
     ],
 )
-def test_wrong_options_end_with_code_2_and_say_what_is_allowed(
-    options: list[str], says: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_options_end_with_code_2_and_say_what_is_allowed(options: list[str], says: str, capsys):
     with pytest.raises(SystemExit) as ended:
         main(options)
     assert ended.value.code == 2
@@ -102,7 +100,7 @@ def test_wrong_options_end_with_code_2_and_say_what_is_allowed(
 
 
 @pytest.mark.parametrize(("which", "number"), [(0, None), (1, signal.SIGTERM)], ids=["its input ends", "signal"])
-def test_it_ends_cleanly(pair: tuple[Served, Served], which: int, number: signal.Signals | None) -> None:
+def test_it_ends_cleanly(pair: tuple[Served, Served], which: int, number: signal.Signals | None):
     """It ends with its input so that it cannot outlive its owner. Those that were asked above end here."""
     assert pair[which].end(number) == (0, "")
 
@@ -127,13 +125,13 @@ def lagging(lag: float) -> World:
     return world
 
 
-def test_a_picture_waits_for_the_arm_to_come_to_its_exposure() -> None:
+def test_a_picture_waits_for_the_arm_to_come_to_its_exposure():
     world = lagging(0.015)
     assert serve.picture(world, "scan", 1.0, 0.002).shape == (480, 640)
     assert 1.0 <= world.arm.time < 1.0 + 2 * serve.PERIOD
 
 
-def test_a_picture_does_not_wait_for_ever() -> None:
+def test_a_picture_does_not_wait_for_ever():
     world = lagging(5.0)
     assert serve.picture(world, "scan", 1.0, 0.002).shape == (480, 640)
     assert world.clock.now() == pytest.approx(1.0 + serve.ARM_LAG, abs=2 * serve.PERIOD)

@@ -52,9 +52,7 @@ def run_step(
         ).run()
 
 
-def test_a_step_past_its_deadline_is_ended_out_of_its_wait_with_the_arm_stopped(
-    cell: VirtualCell, tmp_path: Path
-) -> None:
+def test_a_step_past_its_deadline_is_ended_out_of_its_wait_with_the_arm_stopped(cell: VirtualCell, tmp_path):
     threads: list[str] = []
 
     def slow(context: StepContext) -> None:
@@ -70,9 +68,7 @@ def test_a_step_past_its_deadline_is_ended_out_of_its_wait_with_the_arm_stopped(
     assert 2.0 <= cell.clock.now() < 5.0
 
 
-def test_a_step_that_catches_its_end_and_goes_on_is_told_again_and_begins_nothing(
-    cell: VirtualCell, tmp_path: Path
-) -> None:
+def test_a_step_that_catches_its_end_and_goes_on_is_told_again_and_begins_nothing(cell: VirtualCell, tmp_path):
     told: list[str] = []
 
     def stubborn(context: StepContext) -> None:
@@ -93,15 +89,15 @@ def test_a_step_that_catches_its_end_and_goes_on_is_told_again_and_begins_nothin
 
 @pytest.mark.parametrize(("each_s", "outcome"), [(3.0, "done"), (4.0, "faulted")])
 def test_a_safe_stop_whose_parts_are_in_time_and_whose_whole_is_not_is_not_confirmed(
-    cell: VirtualCell, tmp_path: Path, each_s: float, outcome: str
-) -> None:
+    cell: VirtualCell, tmp_path, each_s: float, outcome: str
+):
     parts = dict.fromkeys("abc", lambda: cell.clock.sleep(each_s))
     result = run_step(cell, tmp_path, lambda context: None, stop=lambda: waiting_on(cell.clock).each(parts, 5.0))
     assert result.outcome.value == outcome
     assert ("did not end within 10 s" in str(result.reason)) == (outcome == "faulted")
 
 
-def test_a_request_in_the_journal_is_seen_while_the_step_waits(cell: VirtualCell, tmp_path: Path) -> None:
+def test_a_request_in_the_journal_is_seen_while_the_step_waits(cell: VirtualCell, tmp_path):
     def asking(context: StepContext) -> None:
         request(tmp_path, "abort", "by another process")
         cell.clock.sleep(100.0)
@@ -111,7 +107,7 @@ def test_a_request_in_the_journal_is_seen_while_the_step_waits(cell: VirtualCell
     assert cell.clock.now() < 2.0
 
 
-def test_held_work_hears_that_it_is_to_end_although_no_time_passes(cell: VirtualCell, tmp_path: Path) -> None:
+def test_held_work_hears_that_it_is_to_end_although_no_time_passes(cell: VirtualCell, tmp_path):
     control = RunControl()
     went_on: list[bool] = []
     # Should it not hear, the test ends all the same.
@@ -131,7 +127,7 @@ def test_held_work_hears_that_it_is_to_end_although_no_time_passes(cell: Virtual
     assert cell.clock.now() - before < 0.5
 
 
-def test_work_that_was_told_to_end_has_its_grace_to_do_so(cell: VirtualCell) -> None:
+def test_work_that_was_told_to_end_has_its_grace_to_do_so(cell: VirtualCell):
     def tidy() -> None:
         try:
             cell.clock.sleep(100.0)
@@ -147,7 +143,7 @@ def test_work_that_was_told_to_end_has_its_grace_to_do_so(cell: VirtualCell) -> 
     assert tidied == [pytest.approx(1.0, abs=0.3)]
 
 
-def test_time_that_another_thread_lets_pass_ends_nothing_there(cell: VirtualCell) -> None:
+def test_time_that_another_thread_lets_pass_ends_nothing_there(cell: VirtualCell):
     waiting = InLine(cell.clock)
     seen: list[str] = []
 
@@ -166,7 +162,7 @@ def test_time_that_another_thread_lets_pass_ends_nothing_there(cell: VirtualCell
     assert set(seen) == {threading.current_thread().name}
 
 
-def test_the_stop_is_not_ended_by_what_it_is_for(cell: VirtualCell) -> None:
+def test_the_stop_is_not_ended_by_what_it_is_for(cell: VirtualCell):
     stopped: list[float] = []
 
     def stop() -> str:
@@ -180,7 +176,7 @@ def test_the_stop_is_not_ended_by_what_it_is_for(cell: VirtualCell) -> None:
     assert stopped == [pytest.approx(begun + 3.0, abs=0.1)]
 
 
-def test_each_action_is_done_whatever_becomes_of_the_others(cell: VirtualCell) -> None:
+def test_each_action_is_done_whatever_becomes_of_the_others(cell: VirtualCell):
     done: list[str] = []
 
     def fails() -> None:
@@ -197,7 +193,7 @@ def test_each_action_is_done_whatever_becomes_of_the_others(cell: VirtualCell) -
     assert cell.clock.now() < 10.0
 
 
-def test_an_action_that_goes_on_past_its_end_confirms_nothing(cell: VirtualCell) -> None:
+def test_an_action_that_goes_on_past_its_end_confirms_nothing(cell: VirtualCell):
     def stubborn() -> None:
         with contextlib.suppress(Cancelled):
             cell.clock.sleep(10.0)
@@ -207,7 +203,7 @@ def test_an_action_that_goes_on_past_its_end_confirms_nothing(cell: VirtualCell)
     ]
 
 
-def test_in_threads_none_waits_for_another_and_what_is_not_confirmed_in_time_is_told() -> None:
+def test_in_threads_none_waits_for_another_and_what_is_not_confirmed_in_time_is_told():
     done, go_on = [], threading.Event()
 
     def fails() -> None:
@@ -226,5 +222,5 @@ def test_in_threads_none_waits_for_another_and_what_is_not_confirmed_in_time_is_
     assert 0.5 <= took < 0.95, "one time limit for all"
 
 
-def test_a_clock_that_runs_by_itself_gets_threads() -> None:
+def test_a_clock_that_runs_by_itself_gets_threads():
     assert isinstance(waiting_on(Clock()), Threads)

@@ -10,7 +10,7 @@ import pytest
 from statemachine.watch import EndSignals, SignalInterrupt, SignalWatch
 
 
-def test_nested_contexts_leave_the_programs_own_handlers_as_they_were() -> None:
+def test_nested_contexts_leave_the_programs_own_handlers_as_they_were():
     before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)]
     outer, inner = EndSignals(), EndSignals()
     with outer:
@@ -26,7 +26,7 @@ def test_nested_contexts_leave_the_programs_own_handlers_as_they_were() -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
-def test_each_signal_to_end_is_raised_outside_of_a_run(number: int) -> None:
+def test_each_signal_to_end_is_raised_outside_of_a_run(number: int):
     usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
     before = signal.signal(number, usual)
     try:

@@ -66,7 +66,7 @@ def half_and_silence() -> Change:
 )
 def test_who_answers_otherwise_is_refused_with_the_reason_before_anything_begins(
     bench: ArmBench, change: Change, words: str
-) -> None:
+):
     begun = time.monotonic()
     with Meddler(bench.address, change) as cable, pytest.raises(NotConnectedError, match=words):
         UrArm("arm", cable.address, connect_timeout=1.0, clock=Clock())
@@ -74,7 +74,7 @@ def test_who_answers_otherwise_is_refused_with_the_reason_before_anything_begins
     assert not bench.ask("show")["moving"]
 
 
-def test_text_messages_between_the_states_are_passed_over(bench: ArmBench) -> None:
+def test_text_messages_between_the_states_are_passed_over(bench: ArmBench):
     """Messages of both versions of the protocol: length, text, length, source, level."""
     text, source = b"Socket vision opened.", b"URControl"
     message = packet("M", bytes([len(text)]) + text + bytes([len(source)]) + source + b"\2")
@@ -90,7 +90,7 @@ def test_text_messages_between_the_states_are_passed_over(bench: ArmBench) -> No
         assert arm.examine(0.2)
 
 
-def test_a_recovery_mode_is_named_with_what_to_do(bench: ArmBench) -> None:
+def test_a_recovery_mode_is_named_with_what_to_do(bench: ArmBench):
     """The joints stand outside the safety limits: programs may not run, a person moves the arm back by hand."""
 
     def change(kind: str, data: bytes) -> list[bytes]:

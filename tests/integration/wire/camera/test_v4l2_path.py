@@ -28,7 +28,7 @@ inside = pytest.mark.skipif(LOADED not in os.environ, reason="only in the proces
 
 
 @pytest.mark.campaign
-def test_the_contract_holds_at_a_video_device_that_the_c_library_makes_believe(tmp_path: Path) -> None:
+def test_the_contract_holds_at_a_video_device_that_the_c_library_makes_believe(tmp_path):
     if (compiler := shutil.which("cc")) is None or LOADED in os.environ:
         pytest.skip("no C compiler is here, or this is the process that has the device")
     library = tmp_path / "video_device.so"
@@ -57,7 +57,7 @@ class TestV4l2(CameraContract):
 
 
 @inside
-def test_a_pictures_time_is_that_of_its_exposure_within_the_bound_that_is_stated() -> None:
+def test_a_pictures_time_is_that_of_its_exposure_within_the_bound_that_is_stated():
     with closing(camera(gain=20.0)) as device:
         device.configure(0.010, 25.0)
         for _ in range(4):
@@ -69,7 +69,7 @@ def test_a_pictures_time_is_that_of_its_exposure_within_the_bound_that_is_stated
 
 
 @inside
-def test_what_it_does_not_have_is_refused_by_name() -> None:
+def test_what_it_does_not_have_is_refused_by_name():
     with pytest.raises(ConfigError, match="gives 640x480 pixels, configured are 1280x1024"):
         camera((1024, 1280))
     with pytest.raises(DeviceFault, match="took pixel format 'YUYV' instead of 'MJPG'"):

@@ -1,7 +1,6 @@
 """A whole job whose scan camera is on GigE Vision: as accurate as over the frame stream."""
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -11,7 +10,7 @@ from tests.support.wire.gige_bench import require_aravis
 pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 
 
-def test_a_dry_run_with_the_scan_camera_on_gige_vision_ends_placed(tmp_path: Path) -> None:
+def test_a_dry_run_with_the_scan_camera_on_gige_vision_ends_placed(tmp_path):
     require_aravis()
     named(tmp_path, "gige", 'address = "192.0.2.20"')
     done = cell("dry-run", "-c", "cell.toml", "--seed", "1", "--json", folder=tmp_path, timeout=900.0)

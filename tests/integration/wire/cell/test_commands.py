@@ -59,7 +59,7 @@ def change(old: str, new: str) -> None:
 
 def test_diag_tells_what_the_devices_tell_changes_nothing_and_fails_when_one_does(
     endpoints: dict[str, Any], typed: Typed
-) -> None:
+):
     before = truth(endpoints)
     code, out, error = typed("diag", "--json")
     after = truth(endpoints)
@@ -85,9 +85,7 @@ def test_diag_tells_what_the_devices_tell_changes_nothing_and_fails_when_one_doe
     assert not json.loads(out)["rail"]["ok"]
 
 
-def test_find_tells_which_configured_addresses_answer_and_touches_nothing(
-    endpoints: dict[str, Any], typed: Typed
-) -> None:
+def test_find_tells_which_configured_addresses_answer_and_touches_nothing(endpoints: dict[str, Any], typed: Typed):
     before = truth(endpoints)
     code, out, error = typed("find", "--json")
     after = truth(endpoints)
@@ -106,7 +104,7 @@ def test_find_tells_which_configured_addresses_answer_and_touches_nothing(
     )
 
 
-def test_the_rail_works_while_the_arm_is_switched_off(endpoints: dict[str, Any], typed: Typed) -> None:
+def test_the_rail_works_while_the_arm_is_switched_off(endpoints: dict[str, Any], typed: Typed):
     change(re.escape(f'"{load_config(Path("cell.toml")).arm.place}"'), '"127.255.0.9"')
     code, out, error = typed("home", "rail")
     assert (code, out) == (0, "rail homed\n"), error
@@ -124,7 +122,7 @@ def test_the_rail_works_while_the_arm_is_switched_off(endpoints: dict[str, Any],
 
 def test_two_jogs_by_5_mm_end_at_10_mm_and_one_after_a_reset_says_that_it_homed(
     endpoints: dict[str, Any], typed: Typed
-) -> None:
+):
     """The rail goes on from where it stands, program after program; only a rail that is not homed is homed."""
 
     def jogged() -> dict[str, str]:
@@ -145,7 +143,7 @@ def test_two_jogs_by_5_mm_end_at_10_mm_and_one_after_a_reset_says_that_it_homed(
     assert truth(endpoints)["rail"]["carriage"] == pytest.approx(0.005, abs=1e-5)
 
 
-def test_jogs_move_and_are_refused_outside_the_limits(endpoints: dict[str, Any], typed: Typed) -> None:
+def test_jogs_move_and_are_refused_outside_the_limits(endpoints: dict[str, Any], typed: Typed):
     before = np.array(truth(endpoints)["poses"]["base_from_flange"])
     assert typed("jog", "arm", "z", "-10mm")[0] == 0
     after = np.array(truth(endpoints)["poses"]["base_from_flange"])
@@ -162,7 +160,7 @@ def test_jogs_move_and_are_refused_outside_the_limits(endpoints: dict[str, Any],
     assert "0 mm" in error or "0 to 100" in error
 
 
-def test_an_arm_whose_program_somebody_has_ended_is_jogged_all_the_same(endpoints: dict[str, Any]) -> None:
+def test_an_arm_whose_program_somebody_has_ended_is_jogged_all_the_same(endpoints: dict[str, Any]):
     wish = parse_jog("arm", ["j1", "+2deg"])
     with Cell.open("cell.toml", only=needed_for(wish)) as opened:
         arm, joints = opened.devices.arm, opened.devices.arm.state().joints
@@ -174,7 +172,7 @@ def test_an_arm_whose_program_somebody_has_ended_is_jogged_all_the_same(endpoint
         assert np.degrees(arm.state().joints - joints)[0] == pytest.approx(2.0, abs=0.01)
 
 
-def test_only_the_device_that_is_used_is_held_and_no_other_can_be_asked(endpoints: dict[str, Any]) -> None:
+def test_only_the_device_that_is_used_is_held_and_no_other_can_be_asked(endpoints: dict[str, Any]):
     config = load_config(Path("cell.toml"))
     with CellLock(config, ["rail"]):
         with CellLock(config, ["vehicle"]):
@@ -188,9 +186,7 @@ def test_only_the_device_that_is_used_is_held_and_no_other_can_be_asked(endpoint
     assert devices.stop() == devices.close() == []
 
 
-def test_a_rail_of_another_maker_is_jogged_from_the_command_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_rail_of_another_maker_is_jogged_from_the_command_line(tmp_path, monkeypatch):
     site = install(tmp_path / "site", "acme-rail", "1.2", "rail.acme = acme_rail:MAKE", acme_rail=RAIL)
     monkeypatch.setenv("PYTHONPATH", str(site), prepend=":")
     (tmp_path / "cell.toml").write_text(with_acme_rail(default_toml()).replace("192.0.2.", "10.255.255."))
@@ -202,7 +198,7 @@ def test_a_rail_of_another_maker_is_jogged_from_the_command_line(
 # --- out of a fault ---
 
 
-def test_an_idle_protective_stop_is_unlocked_by_a_person_who_is_named(endpoints: dict[str, Any], typed: Typed) -> None:
+def test_an_idle_protective_stop_is_unlocked_by_a_person_who_is_named(endpoints: dict[str, Any], typed: Typed):
     ask(endpoints, op="fault", name="arm.protective_stop")
     code, _, error = typed("recover")
     assert code == 2 and "--by NAME" in error
@@ -211,7 +207,7 @@ def test_an_idle_protective_stop_is_unlocked_by_a_person_who_is_named(endpoints:
     assert (code, truth(endpoints)["arm"]["safety"]) == (0, "normal"), error
 
 
-def test_a_homing_that_stopped_goes_on_after_cell_confirm(endpoints: dict[str, Any], here: Path) -> None:
+def test_a_homing_that_stopped_goes_on_after_cell_confirm(endpoints: dict[str, Any], here: Path):
     with started("home", "arm", folder=here) as homing:
         run = wait_for_step(here, "homing", homing)
         ask(endpoints, op="fault", name="arm.protective_stop")
@@ -229,7 +225,7 @@ def word(cell: Cell) -> None:
         cell.current.confirm("Ann")
 
 
-def test_an_arm_that_froze_is_used_again_by_the_same_program(endpoints: dict[str, Any]) -> None:
+def test_an_arm_that_froze_is_used_again_by_the_same_program(endpoints: dict[str, Any]):
     """Its link is lost after 1.5 s of silence: a person's word connects it again."""
     with Cell.open("cell.toml", only=("arm", "vehicle")) as opened:
 
@@ -252,7 +248,7 @@ def test_an_arm_that_froze_is_used_again_by_the_same_program(endpoints: dict[str
 # --- a stop from anywhere ends the run that is going on ---
 
 
-def test_cell_abort_ends_a_calibration(endpoints: dict[str, Any], here: Path, typed: Typed) -> None:
+def test_cell_abort_ends_a_calibration(endpoints: dict[str, Any], here: Path, typed: Typed):
     with started("calibrate", folder=here) as work:
         wait_for_step(here, "calibration", work)
         code, _, said = typed("abort")
@@ -264,7 +260,7 @@ def test_cell_abort_ends_a_calibration(endpoints: dict[str, Any], here: Path, ty
     assert [read_report(run)["outcome"] for run in list_runs(here / "runs")] == ["aborted"]
 
 
-def test_a_jog_is_ended_by_a_request_and_stops_on_its_way(endpoints: dict[str, Any], here: Path) -> None:
+def test_a_jog_is_ended_by_a_request_and_stops_on_its_way(endpoints: dict[str, Any], here: Path):
     with started("jog", "arm", "j1", "+80deg", folder=here) as work:
         request(wait_for_step(here, "jog", work), "abort", "enough")
         _, error = work.communicate(timeout=60)
@@ -278,7 +274,7 @@ def test_a_jog_is_ended_by_a_request_and_stops_on_its_way(endpoints: dict[str, A
 @pytest.mark.parametrize(
     "number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.campaign), signal.SIGINT]
 )
-def test_a_signal_while_the_cell_starts_is_told_and_leaves_no_process(tmp_path: Path, number: signal.Signals) -> None:
+def test_a_signal_while_the_cell_starts_is_told_and_leaves_no_process(tmp_path, number: signal.Signals):
     with started("dry-run", "--seed", "3", folder=tmp_path) as run:
         started_by_it = Path(f"/proc/{run.pid}/task/{run.pid}/children")
         assert until(started_by_it.read_text, 60.0)

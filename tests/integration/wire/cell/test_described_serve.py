@@ -13,7 +13,7 @@ from tests.support.wire.cells import ask, served
 pytestmark = pytest.mark.wire
 
 
-def test_a_cell_of_ones_own_is_served_and_filled_again(here: Path, typed: Typed) -> None:
+def test_a_cell_of_ones_own_is_served_and_filled_again(here: Path, typed: Typed):
     config, own = described(here, {"rail": {"lead": '"5 mm"'}, "cell": {"name": '"Zelle é"'}}, SADDLE)
     write_saddle(here / "saddle.ply")
     with served(here, "-c", config.name, "-j", own.name) as endpoints:

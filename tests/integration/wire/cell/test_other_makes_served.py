@@ -22,7 +22,7 @@ BLOCKS = re.findall(
 
 
 @pytest.fixture
-def configured(tmp_path: Path) -> Path:
+def configured(tmp_path) -> Path:
     """The folder with the stock cell's `cell.toml`, but for the tables that the document prints."""
     modbus, numato, _, robotiq = BLOCKS
     laser = numato[: numato.index("[claw]")] + 'witness = "0 mm"\n'
@@ -33,7 +33,7 @@ def configured(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_devices_keep_the_contracts_of_their_kinds(configured: Path) -> None:
+def test_the_devices_keep_the_contracts_of_their_kinds(configured: Path):
     with served(configured, "-c", "cell.toml", "--seed", "4", "--level", "ideal"):
         done = subprocess.run(
             [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--pyargs",
@@ -50,7 +50,7 @@ def test_the_devices_keep_the_contracts_of_their_kinds(configured: Path) -> None
     assert all(rows[name]["ok"] for name in ("rail", "laser", "claw"))
 
 
-def test_the_whole_job_ends_placed_within_the_bound(configured: Path) -> None:
+def test_the_whole_job_ends_placed_within_the_bound(configured: Path):
     done = cell("dry-run", "-c", "cell.toml", "--seed", "2", "--json", folder=configured, timeout=900.0)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)

@@ -28,11 +28,11 @@ def lean(place: Path) -> str:
     return "lean.toml"
 
 
-def test_the_supervisor_script_of_the_readme_runs_as_printed(supervised: Supervised) -> None:
+def test_the_supervisor_script_of_the_readme_runs_as_printed(supervised: Supervised):
     assert "mean D" in supervised.printed
 
 
-def test_a_run_over_the_wires_places_the_part_within_the_nominal_bound_and_ends_safe(supervised: Supervised) -> None:
+def test_a_run_over_the_wires_places_the_part_within_the_nominal_bound_and_ends_safe(supervised: Supervised):
     placed = supervised.report
     assert placed["outcome"] == "placed"
     assert placed["truth"]["error_mm"]["d"]["mean"] <= 0.60
@@ -42,7 +42,7 @@ def test_a_run_over_the_wires_places_the_part_within_the_nominal_bound_and_ends_
     assert not end["part"]["held"]
 
 
-def test_the_run_folder_holds_everything(supervised: Supervised) -> None:
+def test_the_run_folder_holds_everything(supervised: Supervised):
     folder = supervised.folder / "runs" / supervised.report["run"]
     names = {path.name for path in folder.iterdir()}
     assert {"report.json", "picture.png", "cloud.ply", "journal.sqlite", "frames", "configuration.json", "job.json",
@@ -53,7 +53,7 @@ def test_the_run_folder_holds_everything(supervised: Supervised) -> None:
     assert done == [step["name"] for step in supervised.report["steps"]]
 
 
-def test_the_record_holds_what_passed_on_the_wires(supervised: Supervised, tmp_path: Path) -> None:
+def test_the_record_holds_what_passed_on_the_wires(supervised: Supervised, tmp_path):
     record = supervised.folder / "runs" / supervised.report["run"] / "record.mcap"
     told = information(record)
     messages = {channel["topic"]: channel["messages"] for channel in told["channels"]}
@@ -70,8 +70,8 @@ def test_the_record_holds_what_passed_on_the_wires(supervised: Supervised, tmp_p
 
 
 def test_ctrl_c_in_the_sweep_ends_safe_with_130_and_uncalibrated_it_is_refused(
-    place: Path, lean: str, tmp_path: Path, typed: Typed
-) -> None:
+    place: Path, lean: str, tmp_path, typed: Typed
+):
     with served(place, "-c", lean, "--seed", "3") as endpoints:
         # No calibration lies beside this copy.
         shutil.copy(place / "sim.toml", tmp_path)
@@ -89,7 +89,7 @@ def test_ctrl_c_in_the_sweep_ends_safe_with_130_and_uncalibrated_it_is_refused(
         assert_safe(endpoints)
 
 
-def test_a_killed_simulation_is_reported_within_ten_seconds(place: Path, lean: str) -> None:
+def test_a_killed_simulation_is_reported_within_ten_seconds(place: Path, lean: str):
     with started("dry-run", "-c", lean, "--seed", "3", "--json", folder=place) as run:
         wait_for_step(place, "drive_to_target", run)
         children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
@@ -109,7 +109,7 @@ def test_a_killed_simulation_is_reported_within_ten_seconds(place: Path, lean: s
 
 
 @pytest.mark.campaign
-def test_two_dry_runs_at_once_do_not_disturb_each_other(place: Path) -> None:
+def test_two_dry_runs_at_once_do_not_disturb_each_other(place: Path):
     again = ("dry-run", "--seed", "3", "--until", "board_photo", "--json")
     with started(*again, folder=place) as first, started(*again, folder=place) as second:
         texts = [run.communicate(timeout=240) for run in (first, second)]

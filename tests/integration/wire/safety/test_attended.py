@@ -108,7 +108,7 @@ def bench() -> Iterator[Bench]:
             peer.stop()
 
 
-def test_arm_and_rail_stand_soon_after_silence_and_after_the_program_froze(bench: Bench) -> None:
+def test_arm_and_rail_stand_soon_after_silence_and_after_the_program_froze(bench: Bench):
     bench.say(10)
     Clock().sleep(0.7)
     assert bench.moving() == (True, True)
@@ -126,7 +126,7 @@ def test_arm_and_rail_stand_soon_after_silence_and_after_the_program_froze(bench
 
 
 @pytest.mark.campaign
-def test_arm_and_rail_stand_soon_after_the_program_was_killed(bench: Bench) -> None:
+def test_arm_and_rail_stand_soon_after_the_program_was_killed(bench: Bench):
     _end(bench, signal.SIGKILL)
 
 

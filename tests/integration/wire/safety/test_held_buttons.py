@@ -26,7 +26,7 @@ NUMBERS = itertools.count(1)
 
 
 @pytest.fixture(scope="module")
-def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
+def cell(tmp_path_factory) -> Iterator[Cell]:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("cell"))
         with Cell.open(sim="all", seed=3, speed=1.0) as opened:
@@ -52,7 +52,7 @@ def beat(page: ClientConnection, device: str, axis: str, sign: int, over: thread
 
 @pytest.mark.parametrize(("device", "axis"), [("arm", "z"), ("arm", "j1"), ("rail", "")])
 @pytest.mark.parametrize("end", ["silence", "release", "page closed", "server frozen", "server killed", "stop"])
-def test_a_held_button_ends_in_time(cell: Cell, device: str, axis: str, end: str) -> None:
+def test_a_held_button_ends_in_time(cell: Cell, device: str, axis: str, end: str):
     if not cell.devices.gate.is_open:
         cell.clear_stop("the test")
     sign = 1 if next(NUMBERS) % 2 else -1

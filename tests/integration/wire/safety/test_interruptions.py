@@ -31,7 +31,7 @@ def retries(report: dict[str, Any], step: str) -> int:
     return int(next(row["retries"] for row in report["steps"] if row["name"] == step))
 
 
-def test_the_cell_recovers_from_a_protective_stop_in_the_sweep_and_a_lost_bus_on_the_way(place: Path) -> None:
+def test_the_cell_recovers_from_a_protective_stop_in_the_sweep_and_a_lost_bus_on_the_way(place: Path):
     report = dry_run(place, "can.bus_off@drive_to_target:30%", "arm.protective_stop@laser_sweep:40%")
     assert report["outcome"] == "placed", report["reason"]
     assert retries(report, "drive_to_target") >= 1 and retries(report, "laser_sweep") >= 1
@@ -44,7 +44,7 @@ def vehicle_place(endpoints: dict[str, Any]) -> list[float]:
     return [pose[0][3], pose[1][3]]
 
 
-def test_an_aborted_run_is_resumed_without_driving_or_sweeping_again(place: Path) -> None:
+def test_an_aborted_run_is_resumed_without_driving_or_sweeping_again(place: Path):
     with served(place, "--seed", "3") as endpoints:
         with started("run", "-c", "sim.toml", "--at-start", "--json", folder=place) as run:
             folder = wait_for_step(place, "place", run)

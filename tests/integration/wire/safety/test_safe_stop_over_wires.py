@@ -1,7 +1,5 @@
 """The safe stop brings everything to rest at once, by the world's truth, and shuts the gate for whoever works."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -14,7 +12,7 @@ from tests.support.wire.cells import ask, assert_safe, served
 pytestmark = pytest.mark.wire
 
 
-def test_everything_moves_and_shines_and_nothing_does_after_the_stop(tmp_path: Path) -> None:
+def test_everything_moves_and_shines_and_nothing_does_after_the_stop(tmp_path):
     with served(tmp_path, "--seed", "3", "--speed", "1") as endpoints:
         config = load_config(tmp_path / "sim.toml")
         devices = connect(config)

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.wire
 bench, enabled = conftest.bench, conftest.enabled
 
 
-def test_it_drives_as_told_and_odometry_follows(enabled: Bench) -> None:
+def test_it_drives_as_told_and_odometry_follows(enabled: Bench):
     enabled.drive_for(3.0, 0.3, 0.4)
     state = enabled.vehicle.state()
     assert (state.speed, state.yaw_rate) == pytest.approx((0.3, 0.4), abs=0.005)
@@ -30,7 +30,7 @@ def test_it_drives_as_told_and_odometry_follows(enabled: Bench) -> None:
     assert state.yaw == pytest.approx(yaw, abs=0.005)
 
 
-def test_recovering_clears_the_error_with_the_brake_locked_all_along(enabled: Bench) -> None:
+def test_recovering_clears_the_error_with_the_brake_locked_all_along(enabled: Bench):
     enabled.vehicle.brake()
     enabled.until(lambda: enabled.model.feedback(enabled.world.now()).braked)
     enabled.peer.fault("vehicle.motor_fault")
@@ -69,9 +69,7 @@ class Recorder(can.Listener):
         ("can.second_vehicle", (0x311, b"\x00\x00\x2e\xe0"), "vehicle.two_vehicles", False),
     ],
 )
-def test_it_is_braked_first_against_others_on_the_bus(
-    fault: str, mark: tuple[int, bytes], code: str, asked: bool
-) -> None:
+def test_it_is_braked_first_against_others_on_the_bus(fault: str, mark: tuple[int, bytes], code: str, asked: bool):
     """It locks the brake within 0.2 s of the first foreign frame, by itself, whether it is `asked` meanwhile or not."""
     with benched(1.0) as made, can.Bus(interface="slcan", channel=made.peer.channel, sleep_after_open=0) as bus:
         recorder = Recorder()
@@ -115,7 +113,7 @@ def test_it_is_braked_first_against_others_on_the_bus(
             notifier.stop()
 
 
-def test_a_driver_that_never_took_command_knows_nothing_of_the_brake_and_sends_no_motion(bench: Bench) -> None:
+def test_a_driver_that_never_took_command_knows_nothing_of_the_brake_and_sends_no_motion(bench: Bench):
     assert bench.vehicle.state().braked is None
     with can.Bus(interface="slcan", channel=bench.peer.channel, sleep_after_open=0, timeout=0.02) as observer:
         bench.vehicle.close()

@@ -3,7 +3,6 @@
 import os
 import pty
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 
 import pytest
 
@@ -13,7 +12,7 @@ from cell.config.cell_config import DEVICES, load_config
 from drivers.vehicle.health import CanInterface
 
 
-def test_packages_are_held_against_the_pins() -> None:
+def test_packages_are_held_against_the_pins():
     def installed(name: str) -> str:
         if name in ("canopen", "cascadio"):
             raise PackageNotFoundError(name)
@@ -28,7 +27,7 @@ def test_packages_are_held_against_the_pins() -> None:
     assert (rows[2].state, rows[2].mend) == ("not needed", "pip install 'cascadio<0.2,>=0.1'")
 
 
-def test_a_package_of_the_same_name_is_told(tmp_path: Path) -> None:
+def test_a_package_of_the_same_name_is_told(tmp_path):
     ours = {name: ["assembly-cell", "assembly-cell"] for name in OWN}
     assert shadow_check(lambda: ours).state == "ok"
     row = shadow_check(lambda: {**ours, "statemachine": ["assembly-cell", "python-statemachine"]})
@@ -37,7 +36,7 @@ def test_a_package_of_the_same_name_is_told(tmp_path: Path) -> None:
     assert shadow_check(lambda: ours, tmp_path).found.startswith("cell is imported from ")
 
 
-def test_a_port_and_its_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_and_its_group(tmp_path, monkeypatch):
     config = load_config(None)
     others = [name for name in DEVICES if name != "rail"]
     (row,) = (row for row in link_checks(config, others, tmp_path) if row.state != "not needed")
@@ -64,14 +63,14 @@ def test_a_port_and_its_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         (CanInterface("can0", True), "ok", ""),
     ],
 )
-def test_a_can_interface_against_the_configuration(about: CanInterface | None, verdict: str, mend: str) -> None:
+def test_a_can_interface_against_the_configuration(about: CanInterface | None, verdict: str, mend: str):
     vehicle = load_config(None).vehicle.model_copy(update={"interface": "socketcan", "channel": "can0"})
     row = can_check("vehicle", vehicle, about)
     assert row.state == verdict
     assert row.mend.startswith(mend)
 
 
-def test_room_clock_and_date(tmp_path: Path) -> None:
+def test_room_clock_and_date(tmp_path):
     (tmp_path / "runs" / "20260101T000000-0001").mkdir(parents=True)
     assert doctor.disk_check(tmp_path / "runs" / "not" / "yet", wanted=0).state == "ok"
     row = doctor.disk_check(tmp_path / "runs", wanted=10**18)

@@ -31,7 +31,7 @@ print(len(told), told[0].count("Reinstall numba"), error < 0.2)
 """
 
 
-def test_without_numba_the_cell_says_so_once_and_still_finds_stripes() -> None:
+def test_without_numba_the_cell_says_so_once_and_still_finds_stripes():
     done = subprocess.run([sys.executable, "-c", WITHOUT_NUMBA], capture_output=True, text=True, timeout=120)
     assert done.stdout.split() == ["1", "1", "True"], done.stderr
 
@@ -71,9 +71,9 @@ def loaded() -> list[str]:
     return done.stdout.split()
 
 
-def test_the_door_itself_does_not_wait_for_numba(loaded: list[str]) -> None:
+def test_the_door_itself_does_not_wait_for_numba(loaded: list[str]):
     assert loaded[0] == "False"
 
 
-def test_nothing_is_loaded_or_compiled_any_more_when_a_sweep_has_begun(loaded: list[str]) -> None:
+def test_nothing_is_loaded_or_compiled_any_more_when_a_sweep_has_begun(loaded: list[str]):
     assert loaded[1:] == ["True", "True"]

@@ -6,7 +6,7 @@ from cell.base import lateness
 from cell.base.lateness import Lateness, busy_words
 
 
-def test_late_naps_count_only_while_somebody_measures() -> None:
+def test_late_naps_count_only_while_somebody_measures():
     measured = Lateness()
     measured._late.extend([0.001] * 90 + [0.02] * 9 + [0.3])
     assert (measured.worst, measured.usual) == (0.0, 0.0)
@@ -14,7 +14,7 @@ def test_late_naps_count_only_while_somebody_measures() -> None:
     assert (measured.worst, measured.usual) == (0.3, 0.02)
 
 
-def test_the_last_user_ends_it_and_the_next_begins_anew() -> None:
+def test_the_last_user_ends_it_and_the_next_begins_anew():
     measured = Lateness()
     measured.begin(3.0)
     measured.begin(2.0)
@@ -30,9 +30,7 @@ def test_the_last_user_ends_it_and_the_next_begins_anew() -> None:
 
 
 @pytest.mark.parametrize(("late", "words"), [(0.008, None), (0.009, "wakes up 9 ms late, allowed 8 ms")])
-def test_a_busy_computer_is_told_with_its_figure(
-    late: float, words: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_busy_computer_is_told_with_its_figure(late: float, words: str | None, monkeypatch):
     measured = Lateness()
     measured._users = 1
     measured._late.append(late)

@@ -1,7 +1,6 @@
 """A file that is no TOML of ours is refused by name, with the line and what to do about it."""
 
 import os
-from pathlib import Path
 from typing import Annotated
 
 import pytest
@@ -36,21 +35,21 @@ class File(Table):
         (b"a = " + b"[" * 5000, "not valid TOML"),
     ],
 )
-def test_a_file_that_is_no_toml_is_refused_with_its_line(tmp_path: Path, content: bytes, says: str) -> None:
+def test_a_file_that_is_no_toml_is_refused_with_its_line(tmp_path, content: bytes, says: str):
     path = tmp_path / "wrong.toml"
     path.write_bytes(content)
     with pytest.raises(ConfigError, match=rf"(?s)wrong\.toml.*{says}"):
         read_toml(path, "configuration", "cell init")
 
 
-def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_file_is_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path, says in ((tmp_path, "is a folder"), (tmp_path / "pipe", "no regular file"), (tmp_path / "x", "`cell in")):
         with pytest.raises(ConfigError, match=says):
             read_toml(path, "configuration", "cell init")
 
 
-def test_all_mistakes_are_told_at_once_each_by_its_key() -> None:
+def test_all_mistakes_are_told_at_once_each_by_its_key():
     with pytest.raises(ConfigError) as caught:
         validate(File, {"rail": {"lead": 2, "laed": "2 mm"}, "name": 7}, "cell.toml")
     head, *lines = str(caught.value).splitlines()
@@ -58,7 +57,7 @@ def test_all_mistakes_are_told_at_once_each_by_its_key() -> None:
     assert [line.split(":")[0].strip() for line in lines] == ["rail.lead", "rail.laed", "name"]
 
 
-def test_a_record_that_was_kept_is_restored_to_the_last_digit(tmp_path: Path) -> None:
+def test_a_record_that_was_kept_is_restored_to_the_last_digit(tmp_path):
     path = tmp_path / "kept.json"
     path.write_text('{"rail": {"lead": 0.0020000000000000005}}')
     assert restored(File, path).rail.lead == 0.0020000000000000005

@@ -1,7 +1,5 @@
 """A way between two stops that the vehicle cannot go is refused; the other refusals: `test_wrong_inputs.py`."""
 
-from pathlib import Path
-
 import pytest
 
 from cell.check.fit import require_fit
@@ -20,9 +18,7 @@ from tests.unit.cell.config.test_job import changed_copy
         ("0.4 m/s", "0.025 m/s", r"from stop left to stop right takes \d+ s \(allowed: at most 150 s\)"),
     ],
 )
-def test_a_way_between_two_stops_that_the_vehicle_cannot_go_is_refused(
-    tmp_path: Path, old: str, new: str, words: str
-) -> None:
+def test_a_way_between_two_stops_that_the_vehicle_cannot_go_is_refused(tmp_path, old: str, new: str, words: str):
     job, mesh = load_job(f"{changed_copy('two-stations', tmp_path, old, new)}#2")
     with pytest.raises(ConfigError, match=words):
         require_fit(job, load_config(None), mesh)

@@ -3,7 +3,6 @@
 import re
 from functools import reduce
 from operator import getitem
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,7 +30,7 @@ def changed(key: str, value: Any) -> Job:
     return validate(Job, raw, "job")
 
 
-def test_the_drawing_of_the_part_is_held_against_that_of_the_surface(tmp_path: Path) -> None:
+def test_the_drawing_of_the_part_is_held_against_that_of_the_surface(tmp_path):
     job, mesh = load_job(job_with_part(tmp_path, "pot"))
     assert list(mating_problems(job, mesh)) == []
     *_, boxed, face, looked = contact_notes(job, mesh)
@@ -48,7 +47,7 @@ def test_the_drawing_of_the_part_is_held_against_that_of_the_surface(tmp_path: P
         require_fit(wrong, CONFIG, mesh)
 
 
-def test_without_a_mesh_of_the_part_it_is_told_what_is_not_looked_at() -> None:
+def test_without_a_mesh_of_the_part_it_is_told_what_is_not_looked_at():
     job, mesh = load_job("pot")
     assert list(mating_problems(job, mesh)) == []
     told = "whether its underside fits the surface, and how it lies once it was placed, is not looked at"
@@ -56,7 +55,7 @@ def test_without_a_mesh_of_the_part_it_is_told_what_is_not_looked_at() -> None:
 
 
 @pytest.mark.parametrize("name", shipped_jobs())
-def test_the_jobs_that_ship_make_sense(name: str) -> None:
+def test_the_jobs_that_ship_make_sense(name: str):
     job, mesh = load_job(name)
     assert list(contact_problems(job, CONFIG, mesh)) == []
 
@@ -79,24 +78,24 @@ def test_the_jobs_that_ship_make_sense(name: str) -> None:
         ("place.surface_from_part.translation", ["300 mm", "0 mm", "0 mm"], "0 % of the part's footprint"),
     ],
 )
-def test_a_senseless_put_down_is_refused_with_its_number(key: str, value: Any, told: str) -> None:
+def test_a_senseless_put_down_is_refused_with_its_number(key: str, value: Any, told: str):
     problems = list(contact_problems(changed(key, value), CONFIG, MESH))
     assert any(re.search(told, problem) for problem in problems), problems
 
 
-def test_a_part_whose_lowest_plane_ends_over_the_surface_comes_down_onto_it() -> None:
+def test_a_part_whose_lowest_plane_ends_over_the_surface_comes_down_onto_it():
     """The surface lies 0.1 mm below that plane, within `place.contact_travel`."""
     higher = changed("place.surface_from_part.translation", ["0 mm", "0 mm", "8.49 mm"])
     assert under_part(higher, MESH)[1] == pytest.approx(-0.1e-3, abs=0.02e-3)
     assert list(contact_problems(higher, CONFIG, MESH)) == []
 
 
-def test_how_deep_the_surface_reaches_into_the_part_is_noted() -> None:
+def test_how_deep_the_surface_reaches_into_the_part_is_noted():
     deeper = changed("place.surface_from_part.translation", ["0 mm", "0 mm", "-5 mm"])
     assert "13.4 mm into the part's box of 20 mm" in next(contact_notes(deeper, MESH))
 
 
 @pytest.mark.parametrize(("turn", "wrong"), [("0 deg", False), ("180 deg", True)])
-def test_a_surface_that_faces_away_from_the_part_is_refused(turn: str, wrong: bool) -> None:
+def test_a_surface_that_faces_away_from_the_part_is_refused(turn: str, wrong: bool):
     job = changed("place.surface_from_part.rotation", [turn, "0 deg", "0 deg"])
     assert any("face away" in text for text in surface_problems(job, mesh_box(MESH, "m"), MESH)) == wrong

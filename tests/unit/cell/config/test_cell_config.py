@@ -52,7 +52,7 @@ def mover_of(config: CellConfig, job: Job | None = JOB) -> tuple[VirtualCell, Mo
     return cell, Mover(cell.devices.arm, cell.clock, config, job, interlocks=cell.devices.interlocks)
 
 
-def test_the_arm_goes_round_a_post_on_the_vehicle_and_a_raw_move_into_it_is_refused(tmp_path: Path) -> None:
+def test_the_arm_goes_round_a_post_on_the_vehicle_and_a_raw_move_into_it_is_refused(tmp_path):
     _, free = mover_of(load_config(None), None)
     free.to_joints(HOME)
     turned = HOME + np.array([1.2, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -70,7 +70,7 @@ def test_the_arm_goes_round_a_post_on_the_vehicle_and_a_raw_move_into_it_is_refu
         cell.devices.arm.move_joints(turned, 0.3, 1.0)
 
 
-def test_an_obstacle_is_read_with_units_and_one_name_each(tmp_path: Path) -> None:
+def test_an_obstacle_is_read_with_units_and_one_name_each(tmp_path):
     assert configured(tmp_path, POST % (0, 600)).obstacle[0].size == pytest.approx((0.06, 0.06, 0.7))
     assert configured(tmp_path, POST % (0, 600)).calibration_hash() == load_config(None).calibration_hash()
     with pytest.raises(ConfigError, match="obstacle post is there twice"):
@@ -91,7 +91,7 @@ def beside_the_target(solid: Upright, gap: float) -> Job:
     return JOB.model_copy(update={"obstacle": (beam,)})
 
 
-def test_the_vehicle_keeps_the_arm_that_it_carries_off_the_station(tmp_path: Path) -> None:
+def test_the_vehicle_keeps_the_arm_that_it_carries_off_the_station(tmp_path):
     config = load_config(None)
     cell, mover = mover_of(config)
     mover.to_joints(HOME)
@@ -109,7 +109,7 @@ def test_the_vehicle_keeps_the_arm_that_it_carries_off_the_station(tmp_path: Pat
         way.require_line(target)
 
 
-def test_a_jobs_obstacle_is_met_by_no_planned_way(tmp_path: Path) -> None:
+def test_a_jobs_obstacle_is_met_by_no_planned_way(tmp_path):
     config = load_config(None)
     cell, mover = mover_of(config)
     mover.to_joints(HOME)
@@ -126,7 +126,7 @@ def test_a_jobs_obstacle_is_met_by_no_planned_way(tmp_path: Path) -> None:
         mover.plan_to(goal, "down")
 
 
-def test_a_raw_joint_move_takes_no_corner_of_the_tool_faster_than_allowed() -> None:
+def test_a_raw_joint_move_takes_no_corner_of_the_tool_faster_than_allowed():
     config = load_config(None)
     cell, mover = mover_of(config, None)
     mover.to_joints(HOME)
@@ -159,13 +159,13 @@ def edited(**changes: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("lead", ["50.1 mm", "0.09 mm"])
-def test_a_wrong_configuration_is_refused_by_key_and_value(lead: str) -> None:
+def test_a_wrong_configuration_is_refused_by_key_and_value(lead: str):
     """Wrong values of all other keys: `integration/virtual/test_wrong_inputs.py`."""
     with pytest.raises(ConfigError, match=r"rail\.lead: .*0\.1 to 50 mm"):
         validate(CellConfig, edited(rail__lead=lead), "cell.toml")
 
 
-def test_addresses_do_not_make_a_calibration_foreign_but_optics_do() -> None:
+def test_addresses_do_not_make_a_calibration_foreign_but_optics_do():
     own = load_config(None).calibration_hash()
     moved = validate(CellConfig, edited(scan_camera__address="10.0.0.1:1", rail__url="/dev/ttyUSB9"), "cell.toml")
     other = validate(CellConfig, edited(scan_camera__focal_length="8.1 mm"), "cell.toml")

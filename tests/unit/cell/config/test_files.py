@@ -35,7 +35,7 @@ ENDPOINTS = {
 @pytest.mark.parametrize("words", MOVING, ids=" ".join)
 def test_nothing_moves_without_a_configuration_of_the_present_folder_or_at_the_examples_addresses(
     typed: Typed, words: list[str]
-) -> None:
+):
     code, _, error = typed(*words)
     assert code == 2 and "there is no cell.toml" in error and "192.0.2" not in error
     Path("mine.toml").write_text(default_toml())
@@ -46,7 +46,7 @@ def test_nothing_moves_without_a_configuration_of_the_present_folder_or_at_the_e
     assert code == 2 and 'arm.address = "192.0.2.77"' in error
 
 
-def test_what_is_named_wins_and_a_simulated_cell_needs_no_file() -> None:
+def test_what_is_named_wins_and_a_simulated_cell_needs_no_file():
     assert find_config(None, simulated=True) is None
     with pytest.raises(ConfigError):
         find_config(None)
@@ -55,14 +55,14 @@ def test_what_is_named_wins_and_a_simulated_cell_needs_no_file() -> None:
     assert find_config(Path("other.toml")) == Path("other.toml")
 
 
-def test_a_broken_local_file_is_no_reason_to_take_another(typed: Typed) -> None:
+def test_a_broken_local_file_is_no_reason_to_take_another(typed: Typed):
     Path("cell.toml").symlink_to("gone.toml")
     for words in (["check"], ["runs"], ["dry-run"], *MOVING):
         code, _, shown = typed(*words)
         assert code == 2 and "cell.toml does not exist" in shown
 
 
-def test_check_reads_the_local_files_and_says_which(typed: Typed) -> None:
+def test_check_reads_the_local_files_and_says_which(typed: Typed):
     assert json.loads(typed("check", "--json")[1])["configuration"] == "the one that ships"
     assert typed("init")[0] == 0
     told = json.loads(typed("check", "--json")[1])
@@ -73,13 +73,13 @@ def test_check_reads_the_local_files_and_says_which(typed: Typed) -> None:
     assert typed("check")[0] == 2
 
 
-def test_runs_are_looked_for_where_the_local_file_says(typed: Typed) -> None:
+def test_runs_are_looked_for_where_the_local_file_says(typed: Typed):
     Path("cell.toml").write_text(default_toml().replace('runs = "runs"', 'runs = "mine"'))
     code, _, shown = typed("report")
     assert code == 2 and str(Path.cwd() / "mine") in shown
 
 
-def test_only_a_simulated_cell_may_confirm_by_itself() -> None:
+def test_only_a_simulated_cell_may_confirm_by_itself():
     real = load_config(None)
     assert real.cell.confirm == "person"
     require_confirm(real)
@@ -93,7 +93,7 @@ def test_only_a_simulated_cell_may_confirm_by_itself() -> None:
         require_real_addresses(simulated)
 
 
-def test_a_real_cell_that_is_to_confirm_by_itself_is_not_opened(tmp_path: Path) -> None:
+def test_a_real_cell_that_is_to_confirm_by_itself_is_not_opened(tmp_path):
     path, text = tmp_path / "cell.toml", default_toml().replace("192.0.2", "127.0.0")
     path.write_text(text)
     with pytest.raises(ConfigError, match="a person looks and confirms"):
@@ -113,6 +113,6 @@ def test_a_real_cell_that_is_to_confirm_by_itself_is_not_opened(tmp_path: Path) 
         ("no toml at all", "runs"),
     ],
 )
-def test_what_goes_on_is_found_however_wrong_the_configuration_has_become(tmp_path: Path, text: str, runs: str) -> None:
+def test_what_goes_on_is_found_however_wrong_the_configuration_has_become(tmp_path, text: str, runs: str):
     (tmp_path / "cell.toml").write_text(text)
     assert runs_folder(tmp_path / "cell.toml") == tmp_path / runs

@@ -10,7 +10,7 @@ from drivers.errors import ConfigError
 
 
 @pytest.mark.usefixtures("here")
-def test_the_job_of_the_present_folder_wins_over_the_one_that_ships() -> None:
+def test_the_job_of_the_present_folder_wins_over_the_one_that_ships():
     shipped = job_path("pot")
     assert shipped.is_absolute()
     Path("pot").mkdir()
@@ -19,7 +19,7 @@ def test_the_job_of_the_present_folder_wins_over_the_one_that_ships() -> None:
     assert (job_path("pot"), job_path(shipped)) == (Path("pot.toml"), shipped)
 
 
-def test_what_a_batch_does_is_checked_and_no_part_of_what_runs_rest_on(tmp_path: Path) -> None:
+def test_what_a_batch_does_is_checked_and_no_part_of_what_runs_rest_on(tmp_path):
     shipped, path = job_path("pot"), tmp_path / "mine.toml"
     text = shipped.read_text().replace('"pot.ply"', f'"{shipped.with_suffix(".ply")}"')
     path.write_text(f'{text}\n[batch]\non_refusal = "skip"\n')
@@ -31,7 +31,7 @@ def test_what_a_batch_does_is_checked_and_no_part_of_what_runs_rest_on(tmp_path:
         load_job(path)
 
 
-def test_an_item_has_its_own_nest_and_surface_and_knows_where_the_others_are() -> None:
+def test_an_item_has_its_own_nest_and_surface_and_knows_where_the_others_are():
     first, third = load_job("tray4")[0], load_job("tray4#3")[0]
     assert item_names("tray4") == [f"tray4#{k}" for k in (1, 2, 3, 4)] and item_names("tray4#2") == ["tray4#2"]
     assert item_names("pot") == ["pot"]
@@ -48,7 +48,7 @@ def test_an_item_has_its_own_nest_and_surface_and_knows_where_the_others_are() -
     assert old.nest is not None and old.nest.base_from_part.translation == (-0.6, 0.06, 0.03)
 
 
-def test_an_item_that_is_not_there_and_items_without_a_nest_are_told(tmp_path: Path) -> None:
+def test_an_item_that_is_not_there_and_items_without_a_nest_are_told(tmp_path):
     for name in ("tray4#5", "pot#1"):
         with pytest.raises(ConfigError, match=r"has \d items: there is no item \d"):
             load_job(name)
@@ -61,7 +61,7 @@ def test_an_item_that_is_not_there_and_items_without_a_nest_are_told(tmp_path: P
         load_job(path)
 
 
-def test_an_item_at_another_stop_has_its_board_way_and_obstacles_and_knows_where_the_first_one_stands() -> None:
+def test_an_item_at_another_stop_has_its_board_way_and_obstacles_and_knows_where_the_first_one_stands():
     left, right = (load_job(f"two-stations#{k}")[0] for k in (1, 2))
     assert (left.at_stop, right.at_stop, load_job("tray4")[0].at_stop) == ("left", "right", None)
     assert (left.board.spec, right.board.spec) == ("marked_dots:9x7:20mm", "marked_dots:11x9:16mm")
@@ -98,12 +98,12 @@ def changed_copy(name: str, folder: Path, old: str, new: str) -> Path:
         ("11x9:16mm", "7x9:16mm", "stops left and right have boards of 9 x 7 points.*board of other counts"),
     ],
 )
-def test_stops_that_cannot_be_told_apart_or_found_are_refused(tmp_path: Path, old: str, new: str, told: str) -> None:
+def test_stops_that_cannot_be_told_apart_or_found_are_refused(tmp_path, old: str, new: str, told: str):
     pose = '{ translation = ["0 mm", "0 mm", "0 mm"], rotation = ["0 deg", "0 deg", "0 deg"] }'
     with pytest.raises(ConfigError, match=told):
         load_job(changed_copy("two-stations", tmp_path, old, new.replace("POSE", pose)))
 
 
-def test_a_single_photograph_is_refused_since_it_does_not_show_whether_the_vehicle_rocks(tmp_path: Path) -> None:
+def test_a_single_photograph_is_refused_since_it_does_not_show_whether_the_vehicle_rocks(tmp_path):
     with pytest.raises(ConfigError, match=r"photo\.count.*2 to 100"):
         load_job(changed_copy("pot", tmp_path, "\ncount = 4", "\ncount = 1"))

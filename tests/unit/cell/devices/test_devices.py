@@ -1,7 +1,6 @@
 """The safe stop brings every device to rest, whatever it does, and bars whoever works; by the world's truth."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,7 +28,7 @@ def stays(cell: VirtualCell, value: Callable[[], object]) -> bool:
     return bool(np.allclose(before, np.array(value(), dtype=float), atol=1e-9))
 
 
-def test_the_laser_goes_off(cell: VirtualCell) -> None:
+def test_the_laser_goes_off(cell: VirtualCell):
     # A switch without an owner: what goes off is what the stop switches off.
     cell.arm.set_digital_output(CONFIG.laser.output, True)
     assert cell.devices.laser.is_on
@@ -37,7 +36,7 @@ def test_the_laser_goes_off(cell: VirtualCell) -> None:
     assert not cell.world.arm.digital_outputs >> CONFIG.laser.output & 1
 
 
-def test_the_vehicle_stands_and_its_brake_is_locked(cell: VirtualCell) -> None:
+def test_the_vehicle_stands_and_its_brake_is_locked(cell: VirtualCell):
     cell.devices.vehicle.brake()
     cell.devices.arm.move_joints(HOME, 0.5, 1.0).wait(60.0)
     cell.devices.vehicle.enable()
@@ -50,7 +49,7 @@ def test_the_vehicle_stands_and_its_brake_is_locked(cell: VirtualCell) -> None:
     assert stays(cell, lambda: model.planar(cell.clock.now()))
 
 
-def test_the_rail_stands(cell: VirtualCell) -> None:
+def test_the_rail_stands(cell: VirtualCell):
     cell.devices.rail.home().wait(60.0)
     cell.devices.rail.move_to(0.09, 0.01)
     cell.clock.sleep(0.4)
@@ -60,7 +59,7 @@ def test_the_rail_stands(cell: VirtualCell) -> None:
     assert stays(cell, lambda: cell.devices.rail.state().position)
 
 
-def test_the_arm_stands(cell: VirtualCell) -> None:
+def test_the_arm_stands(cell: VirtualCell):
     cell.devices.vehicle.brake()
     away = cell.devices.arm.state().joints + np.array([0.8, 0.0, 0.0, 0.0, 0.0, 0.0])
     cell.devices.arm.move_joints(away, 0.3, 1.0)
@@ -70,7 +69,7 @@ def test_the_arm_stands(cell: VirtualCell) -> None:
     assert stays(cell, lambda: cell.devices.arm.state().joints)
 
 
-def test_whoever_works_begins_nothing_any_more(cell: VirtualCell) -> None:
+def test_whoever_works_begins_nothing_any_more(cell: VirtualCell):
     cell.devices.gate.enter(CancelToken())
     cell.devices.gate.require()
     stop_cell(cell.devices)
@@ -78,7 +77,7 @@ def test_whoever_works_begins_nothing_any_more(cell: VirtualCell) -> None:
         cell.devices.gate.require()
 
 
-def test_a_device_that_does_not_confirm_is_named_and_the_others_are_stopped(tmp_path: Path) -> None:
+def test_a_device_that_does_not_confirm_is_named_and_the_others_are_stopped(tmp_path):
     """A stop that was not confirmed is a fault, whatever else answers: here of a vehicle whose driver is closed."""
     cell = VirtualCell(load_config(fixed_cell(tmp_path)), 1)
     cell.arm.set_digital_output(CONFIG.laser.output, True)
@@ -93,7 +92,7 @@ def test_a_device_that_does_not_confirm_is_named_and_the_others_are_stopped(tmp_
 
 
 @pytest.mark.parametrize("name", ["laser", "vehicle", "rail", "arm"])
-def test_a_cell_that_was_opened_without_a_device_stops_the_others(cell: VirtualCell, name: str) -> None:
+def test_a_cell_that_was_opened_without_a_device_stops_the_others(cell: VirtualCell, name: str):
     setattr(cell.devices, f"_{name}", None)
     assert name not in cell.devices
     require_healthy(cell.devices)
@@ -101,7 +100,7 @@ def test_a_cell_that_was_opened_without_a_device_stops_the_others(cell: VirtualC
     assert cell.devices.stop() == []
 
 
-def test_who_closes_the_cell_closes_each_device_and_the_arm_last(cell: VirtualCell) -> None:
+def test_who_closes_the_cell_closes_each_device_and_the_arm_last(cell: VirtualCell):
     """Laser and claw hang on the arm's outputs."""
     names = [device.name for device in cell.devices]
     assert names[-1] == "arm"
@@ -121,7 +120,7 @@ class Stuck:
         raise RuntimeError("its port is stuck")
 
 
-def test_a_device_that_cannot_be_closed_keeps_no_other_open(cell: VirtualCell) -> None:
+def test_a_device_that_cannot_be_closed_keeps_no_other_open(cell: VirtualCell):
     """The laser's driver is the first to be closed; the arm, closed last, takes its output off nevertheless."""
     cell.devices.laser.bare = Stuck(cell.devices.laser.bare)  # type: ignore[assignment]
     cell.arm.set_digital_output(CONFIG.laser.output, True)
@@ -145,7 +144,7 @@ def test_a_device_that_cannot_be_closed_keeps_no_other_open(cell: VirtualCell) -
 )
 def test_what_ails_arm_or_vehicle_ends_a_run_and_in_a_jog_an_emergency_stop_alone(
     cell: VirtualCell, name: str, recoverable: bool
-) -> None:
+):
     require_healthy(cell.devices)
     cell.fault(name)
     with pytest.raises(DeviceFault) as caught:
@@ -159,7 +158,7 @@ def test_what_ails_arm_or_vehicle_ends_a_run_and_in_a_jog_an_emergency_stop_alon
         require_no_emergency_stop(cell.devices)
 
 
-def test_of_two_faults_the_emergency_stop_is_told(cell: VirtualCell) -> None:
+def test_of_two_faults_the_emergency_stop_is_told(cell: VirtualCell):
     cell.fault("arm.protective_stop")
     cell.fault("vehicle.emergency_stop")
     with pytest.raises(DeviceFault) as caught:

@@ -3,7 +3,6 @@
 import os
 import signal
 import socket
-from pathlib import Path
 
 import pytest
 
@@ -29,14 +28,14 @@ def config() -> CellConfig:
     )
 
 
-def test_a_cell_is_held_once_and_free_again_afterwards(config: CellConfig) -> None:
+def test_a_cell_is_held_once_and_free_again_afterwards(config: CellConfig):
     with CellLock(config), pytest.raises(InterlockError, match=f"held by process {os.getpid()}"):
         CellLock(config).__enter__()
     with CellLock(config):
         pass
 
 
-def test_two_configurations_that_share_one_device_are_not_open_at_once(config: CellConfig) -> None:
+def test_two_configurations_that_share_one_device_are_not_open_at_once(config: CellConfig):
     other = config.model_copy(update={"arm": config.arm.model_copy(update={"address": "127.2.0.1"})})
     with CellLock(config):
         with pytest.raises(InterlockError, match="the rail at"):
@@ -46,7 +45,7 @@ def test_two_configurations_that_share_one_device_are_not_open_at_once(config: C
             CellLock(other).__enter__()
 
 
-def test_a_cell_that_another_holds_is_not_opened(config: CellConfig, tmp_path: Path) -> None:
+def test_a_cell_that_another_holds_is_not_opened(config: CellConfig, tmp_path):
     own = config.arm.address
     text = default_toml()
     for wanted, given in (
@@ -61,7 +60,7 @@ def test_a_cell_that_another_holds_is_not_opened(config: CellConfig, tmp_path: P
         Cell.open(tmp_path / "cell.toml")
 
 
-def test_another_user_finds_the_cell_held(config: CellConfig) -> None:
+def test_another_user_finds_the_cell_held(config: CellConfig):
     if os.getuid() != 0:
         pytest.skip("only root can become another user")
     reader, writer = os.pipe()
@@ -81,9 +80,7 @@ def test_another_user_finds_the_cell_held(config: CellConfig) -> None:
 
 
 @pytest.mark.parametrize("listens", [True, False])
-def test_a_name_that_is_taken_denies_nothing(
-    config: CellConfig, listens: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_name_that_is_taken_denies_nothing(config: CellConfig, listens: bool, monkeypatch, tmp_path):
     """No cell has it: who does, and how to go on, is told. Two of this user's cells still exclude each other."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as taken:
         taken.bind(_name("arm", config.device("arm").held))
@@ -101,7 +98,7 @@ def test_a_name_that_is_taken_denies_nothing(
         CellLock(config).__enter__()
 
 
-def test_the_lock_of_a_killed_process_is_free(config: CellConfig) -> None:
+def test_the_lock_of_a_killed_process_is_free(config: CellConfig):
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:

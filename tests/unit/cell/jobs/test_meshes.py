@@ -16,13 +16,13 @@ from tests.support.job_meshes import FOLDER, TRIANGLES
 POINTS = 400_000
 
 
-def test_all_meshes_together_take_no_more_than_300_kb() -> None:
+def test_all_meshes_together_take_no_more_than_300_kb():
     meshes = [path for path in FOLDER.iterdir() if path.suffix != ".toml"]
     assert sorted(path.stem for path in meshes) == sorted([*TRIANGLES, "facets", "shell-part"])
     assert sum(path.stat().st_size for path in meshes) <= 300_000
 
 
-def test_the_part_that_ships_fits_its_surface_and_shows_how_it_lies() -> None:
+def test_the_part_that_ships_fits_its_surface_and_shows_how_it_lies():
     job, mesh = load_job("shell")
     part, belongs = NominalSurface.load(Path(job.part.mesh)), job.place.surface_from_part.se3()
     gap = drawn_gap(NominalSurface.load(mesh), belongs, part)
@@ -32,7 +32,7 @@ def test_the_part_that_ships_fits_its_surface_and_shows_how_it_lies() -> None:
 
 
 @pytest.mark.parametrize("name", TRIANGLES)
-def test_a_mesh_lies_on_its_closed_form(name: str) -> None:
+def test_a_mesh_lies_on_its_closed_form(name: str):
     field = surface(name)
     half = np.array([field.half_x, field.half_y])
     mesh = trimesh.load_mesh(FOLDER / f"{name}.ply")

@@ -13,18 +13,18 @@ from tests.unit.cell.motion.conftest import RESTING, WORKING, down
 from tests.unit.cell.motion.test_kinematics import PUBLISHED, told
 
 
-def test_a_posture_in_the_table_names_what_touches(planner: Planner) -> None:
+def test_a_posture_in_the_table_names_what_touches(planner: Planner):
     with pytest.raises(CollisionError, match=r"deep: .*table"):
         planner.reach(down(0.75, 0.2, 0.10), WORKING, "deep")
 
 
-def test_the_part_may_touch_the_surface_only_where_allowed(planner: Planner) -> None:
+def test_the_part_may_touch_the_surface_only_where_allowed(planner: Planner):
     resting = planner.kinematics.ik(down(0.75, 0.0, 0.222), WORKING)
     assert ("part", "surface") in planner.collisions.touching(resting)
     assert planner.collisions.touching(resting, RESTING) == []
 
 
-def test_bodies_need_names_and_sizes() -> None:
+def test_bodies_need_names_and_sizes():
     with pytest.raises(ValueError, match="three lengths"):
         collision.box("flat", collision.BASE, pin.SE3.Identity(), (1.0, 0.0, 1.0))
     solid = collision.block("twin", collision.BASE, (0, 0, 0), (1, 1, 1))
@@ -32,7 +32,7 @@ def test_bodies_need_names_and_sizes() -> None:
         CollisionModel(ArmKinematics(), [solid, solid])
 
 
-def test_a_fin_thinner_than_a_step_is_found_where_it_stands(arm: ArmKinematics) -> None:
+def test_a_fin_thinner_than_a_step_is_found_where_it_stands(arm: ArmKinematics):
     fin = collision.block("fin", collision.BASE, (0.3, -0.0005, 0.0), (1.2, 0.0005, 0.9))
     pole = collision.capsule("pole", collision.FLANGE, (0, 0, 0.01), (0, 0, 0.2), 0.01)
     model = CollisionModel(arm, [fin, pole])
@@ -46,7 +46,7 @@ def test_a_fin_thinner_than_a_step_is_found_where_it_stands(arm: ArmKinematics) 
     assert first_touch(model, np.stack([start, end]), (("pole", "fin"),)) is None
 
 
-def test_what_touches_at_the_beginning_may_open_but_not_close(arm: ArmKinematics) -> None:
+def test_what_touches_at_the_beginning_may_open_but_not_close(arm: ArmKinematics):
     floor = collision.block("floor", collision.BASE, (0.3, -0.5, -0.1), (1.2, 0.5, 0.0))
     pole = collision.capsule("pole", collision.FLANGE, (0, 0, 0.0), (0, 0, 0.2), 0.01)
     model = CollisionModel(arm, [floor, pole])
@@ -61,7 +61,7 @@ def test_what_touches_at_the_beginning_may_open_but_not_close(arm: ArmKinematics
 
 
 @pytest.mark.parametrize("name", list(PUBLISHED))
-def test_the_bodies_of_a_calibrated_arm_are_where_the_drawing_has_them_to_a_centimetre(name: str) -> None:
+def test_the_bodies_of_a_calibrated_arm_are_where_the_drawing_has_them_to_a_centimetre(name: str):
     model = PUBLISHED[name][0]
     drawn, calibrated = arm_kinematics(model, None), arm_kinematics(model, told(name))
     bodies = arm_bodies(model)

@@ -16,7 +16,7 @@ from sim_backends.models.arm_kinematics import TABLES, Kinematics
 from tests.unit.cell.motion.conftest import WORKING, down, independent_fk
 
 
-def test_every_reachable_pose_is_reached_exactly_and_on_the_branch_asked_for(arm: ArmKinematics) -> None:
+def test_every_reachable_pose_is_reached_exactly_and_on_the_branch_asked_for(arm: ArmKinematics):
     rng = np.random.default_rng(2)
     for joints in rng.uniform(-2.9, 2.9, (60, 6)):
         pose = arm.fk(joints)
@@ -26,26 +26,26 @@ def test_every_reachable_pose_is_reached_exactly_and_on_the_branch_asked_for(arm
             assert np.allclose(near, joints, atol=1e-6)
 
 
-def test_all_eight_branches_over_the_placement_area_are_found(arm: ArmKinematics) -> None:
+def test_all_eight_branches_over_the_placement_area_are_found(arm: ArmKinematics):
     found = arm.solutions(down(0.75, 0.0, 0.22), WORKING)
     assert len(found) == 8
     far = [float(np.sum((q - WORKING) ** 2)) for q in found]
     assert far == sorted(far)
 
 
-def test_a_pose_out_of_reach_is_refused_with_the_distance(arm: ArmKinematics) -> None:
+def test_a_pose_out_of_reach_is_refused_with_the_distance(arm: ArmKinematics):
     with pytest.raises(Unreachable, match=r"out of reach.*stays \d{2,4}\.\d mm"):
         arm.ik(down(1.9, 0.0, 0.3), WORKING)
 
 
-def test_joint_ranges_are_kept(arm: ArmKinematics) -> None:
+def test_joint_ranges_are_kept(arm: ArmKinematics):
     tight = ArmKinematics(limits=JointLimits(lower=(-np.pi,) * 6, upper=(np.pi,) * 6))
     for joints in tight.solutions(down(0.75, 0.0, 0.22), np.full(6, 3.1)):
         assert np.all(np.abs(joints) <= np.pi)
 
 
 @pytest.mark.parametrize("bad", [{"speed": (0.0,) * 6}, {"jerk": (1.0,) * 5}, {"lower": (7.0,) * 6}])
-def test_limits_that_make_no_sense_are_refused(bad: dict[str, tuple[float, ...]]) -> None:
+def test_limits_that_make_no_sense_are_refused(bad: dict[str, tuple[float, ...]]):
     with pytest.raises(ValueError, match="joint"):
         JointLimits(**bad)
 
@@ -117,7 +117,7 @@ def of_urdf(name: str, joints: np.ndarray) -> pin.SE3:
 
 
 @pytest.mark.parametrize("name", list(URDF))
-def test_each_model_as_drawn_is_that_of_the_vendors_description(name: str) -> None:
+def test_each_model_as_drawn_is_that_of_the_vendors_description(name: str):
     arm, simulated = arm_kinematics(name, None), Kinematics(TABLES[name])
     for joints in np.random.default_rng(3).uniform(-3.0, 3.0, (20, 6)):
         expected = of_urdf(name, joints).homogeneous
@@ -125,12 +125,12 @@ def test_each_model_as_drawn_is_that_of_the_vendors_description(name: str) -> No
         np.testing.assert_allclose(simulated.forward(joints), expected, atol=1e-9)
 
 
-def test_the_cell_and_the_world_know_the_same_models() -> None:
+def test_the_cell_and_the_world_know_the_same_models():
     assert set(MODELS) == set(TABLES) == set(URDF) | {"UR7e", "UR12e"}
 
 
 @pytest.mark.parametrize("name", list(PUBLISHED))
-def test_a_factory_table_is_kept_exactly_and_its_poses_are_reached(name: str) -> None:
+def test_a_factory_table_is_kept_exactly_and_its_poses_are_reached(name: str):
     table = told(name)
     arm = arm_kinematics(PUBLISHED[name][0], table)
     rng = np.random.default_rng(5)
@@ -144,13 +144,13 @@ def test_a_factory_table_is_kept_exactly_and_its_poses_are_reached(name: str) ->
 
 
 @pytest.mark.parametrize("name", ["UR3e", "UR20"])
-def test_an_arm_of_another_model_is_named(name: str) -> None:
+def test_an_arm_of_another_model_is_named(name: str):
     drawn = MODELS[name].table
     with pytest.raises(ConfigError, match=rf"The nearest model is {name} \(0.0 mm\): correct arm.model"):
         arm_kinematics("UR10e", LinkTable(drawn.theta, drawn.a, drawn.d, drawn.alpha))
 
 
-def test_a_calibration_is_named_after_the_table_to_the_last_bit() -> None:
+def test_a_calibration_is_named_after_the_table_to_the_last_bit():
     table = told("first")
     other = LinkTable(table.theta, table.a, table.d, (*table.alpha[:5], 1e-15))
     names = {kinematics_name("UR10e", t) for t in (None, table, other, told("second"))}
@@ -158,7 +158,7 @@ def test_a_calibration_is_named_after_the_table_to_the_last_bit() -> None:
     assert kinematics_name("UR10e", told("first")) == kinematics_name("UR10e", table)
 
 
-def test_kinematics_info_is_read_byte_by_byte() -> None:
+def test_kinematics_info_is_read_byte_by_byte():
     numbers = [float(k) / 8 for k in range(24)]
     data = struct.pack(">6I", *range(1, 7)) + struct.pack(">24d", *numbers) + struct.pack(">I", 2)
     assert parse_kinematics_info(data + b"more") == LinkTable(*(tuple(numbers[k : k + 6]) for k in (0, 6, 12, 18)))

@@ -18,7 +18,7 @@ FLANGE_FROM_TARGET = pin.SE3(pin.utils.rotate("z", np.pi / 2), np.array([-0.10, 
 FLANGE_FROM_SCAN_MIDDLE = pin.SE3(pin.utils.rotate("z", np.pi / 2), np.array([0.09, 0.0, 0.08]))
 
 
-def test_the_job_is_planned_without_touching_anything(planner: Planner) -> None:
+def test_the_job_is_planned_without_touching_anything(planner: Planner):
     scan = planner.reach(down(0.75, -0.09, 0.26), WORKING, "scan")
     above = planner.reach(down(0.75, 0.0, 0.27), scan, "above the place")
     for motion in (planner.free(scan, above), planner.line(above, down(0.75, 0, 0.221), LineLimits(0.04), RESTING)):
@@ -39,7 +39,7 @@ def beside_wall(
     return model, planner, *(planner.reach(down(x, side, 0.25), WORKING, "beside") for side in (y, -y))
 
 
-def test_an_obstacle_in_the_direct_way_is_avoided(arm: ArmKinematics) -> None:
+def test_an_obstacle_in_the_direct_way_is_avoided(arm: ArmKinematics):
     model, planner, left, right = beside_wall(arm, 0.7, 0.35)
     assert not all(model.free(q) for q in plan_joint(left, right, arm.limits).joints)
     motion = planner.free(left, right)
@@ -49,16 +49,14 @@ def test_an_obstacle_in_the_direct_way_is_avoided(arm: ArmKinematics) -> None:
     assert np.array_equal(motion.joints, again.joints)
 
 
-def test_a_slot_that_no_simple_detour_passes_is_searched(arm: ArmKinematics) -> None:
+def test_a_slot_that_no_simple_detour_passes_is_searched(arm: ArmKinematics):
     roof = collision.block("roof", collision.BASE, (0.45, -0.6, 0.75), (1.2, 0.6, 0.80))
     model, planner, left, right = beside_wall(arm, 0.6, 0.30, roof)
     motion = planner.free(left, right)
     assert all(model.free(q) for q in motion.joints)
 
 
-def test_without_ompl_ways_over_one_corner_are_tried_and_what_lacks_is_told(
-    arm: ArmKinematics, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_ompl_ways_over_one_corner_are_tried_and_what_lacks_is_told(arm: ArmKinematics, monkeypatch):
     monkeypatch.setitem(sys.modules, "ompl", None)
     model, planner, left, right = beside_wall(arm, 0.7, 0.35)
     assert first_touch(model, np.stack([left, right])) is not None
@@ -73,13 +71,13 @@ def test_without_ompl_ways_over_one_corner_are_tried_and_what_lacks_is_told(
         planner.free(left, right)
 
 
-def test_an_end_that_touches_is_refused_by_name(planner: Planner) -> None:
+def test_an_end_that_touches_is_refused_by_name(planner: Planner):
     deep = planner.kinematics.ik(down(0.75, 0.2, 0.10), WORKING)
     with pytest.raises(CollisionError, match="the end of the motion"):
         planner.free(WORKING, deep)
 
 
-def test_the_planners_moves_and_lines_keep_to_the_tool_speed(arm: ArmKinematics) -> None:
+def test_the_planners_moves_and_lines_keep_to_the_tool_speed(arm: ArmKinematics):
     model = CollisionModel(arm, collision.arm_bodies() + collision.tool_bodies((0.070, 0.036, 0.020), FLANGE_FROM_PART))
     planner = Planner(arm, model, tool_speed=0.25)
     free = planner.free(WORKING, WORKING + np.array([1.2, 0.1, -0.1, 0, 0, 0.5]))
@@ -118,7 +116,7 @@ def nearest_station_body(solids: list[collision.Body], joints: Joints) -> float:
     return least
 
 
-def test_searched_ways_keep_five_millimetres_between_their_samples(planner: Planner, arm: ArmKinematics) -> None:
+def test_searched_ways_keep_five_millimetres_between_their_samples(planner: Planner, arm: ArmKinematics):
     over_the_deck = arm.ik(pin.SE3(DOWN, np.array([-0.6, 0.0, 0.35])), np.array([0.0, -1.25, 2.0, -2.3, -1.57, 2.8]))
     beside = planner.reach(down(0.75, -0.3, 0.25), WORKING, "beside")
     behind = planner.reach(down(0.68, 0.42, 0.30), WORKING, "behind the board")

@@ -12,7 +12,7 @@ from drivers.errors import RefusedError
 from tests.unit.cell.motion.conftest import DOWN, FLANGE_FROM_PART, WORKING, assert_within, down, independent_fk
 
 
-def test_a_joint_move_is_jerk_limited_and_rests_at_both_ends() -> None:
+def test_a_joint_move_is_jerk_limited_and_rests_at_both_ends():
     limits, start, end = JointLimits(), np.zeros(6), np.array([1.5, -1.0, 0.5, -2.0, 0.1, 0.0])
     motion = trajectory.plan_joint(start, end, limits, period=0.002)
     assert_within(motion, limits)
@@ -20,18 +20,18 @@ def test_a_joint_move_is_jerk_limited_and_rests_at_both_ends() -> None:
     assert np.abs(motion.speeds()[[0, -1]]).max() < 1e-3
 
 
-def test_a_move_to_where_the_arm_stands_is_a_motion_of_one_period() -> None:
+def test_a_move_to_where_the_arm_stands_is_a_motion_of_one_period():
     motion = trajectory.plan_joint(WORKING, WORKING, JointLimits())
     assert motion.duration > 0
     assert np.array_equal(motion.start, motion.end)
 
 
-def test_a_joint_move_out_of_range_is_refused() -> None:
+def test_a_joint_move_out_of_range_is_refused():
     with pytest.raises(RefusedError, match="outside the ranges"):
         trajectory.plan_joint(np.zeros(6), np.array([0, 0, 4.0, 0, 0, 0]), JointLimits())
 
 
-def test_a_line_is_straight_and_turns_evenly(arm: ArmKinematics) -> None:
+def test_a_line_is_straight_and_turns_evenly(arm: ArmKinematics):
     start = arm.ik(down(0.70, -0.1, 0.35), WORKING)
     a = arm.fk(start)
     b = pin.SE3(DOWN @ pin.utils.rotate("z", 0.3), np.array([0.80, 0.10, 0.25]))
@@ -49,9 +49,7 @@ def test_a_line_is_straight_and_turns_evenly(arm: ArmKinematics) -> None:
 
 @pytest.mark.parametrize("leaving", [False, True])
 @pytest.mark.parametrize(("length", "fast"), [(0.05, True), (0.0055, False), (0.004, False)])
-def test_near_its_place_a_line_is_slow_and_beyond_it_fast(
-    arm: ArmKinematics, leaving: bool, length: float, fast: bool
-) -> None:
+def test_near_its_place_a_line_is_slow_and_beyond_it_fast(arm: ArmKinematics, leaving: bool, length: float, fast: bool):
     start = arm.ik(down(0.70, -0.1, 0.35), WORKING)
     goal = arm.fk(start)
     goal.translation -= [0.0, 0.0, length]
@@ -67,14 +65,14 @@ def test_near_its_place_a_line_is_slow_and_beyond_it_fast(
     assert (speeds.max() > 0.12) == fast
 
 
-def test_a_line_through_a_singular_posture_is_refused(arm: ArmKinematics) -> None:
+def test_a_line_through_a_singular_posture_is_refused(arm: ArmKinematics):
     start = np.array([0.0, -1.2, 1.8, -2.1, -0.3, 0.0])
     end = np.array([0.0, -1.2, 1.8, -2.1, 0.3, 0.0])
     with pytest.raises((trajectory.SingularLine, Unreachable)):
         trajectory.plan_line(arm, start, arm.fk(end))
 
 
-def test_motions_join_only_where_they_meet() -> None:
+def test_motions_join_only_where_they_meet():
     a = trajectory.plan_joint(np.zeros(6), np.full(6, 0.1), JointLimits())
     b = trajectory.plan_joint(np.full(6, 0.1), np.full(6, -0.1), JointLimits())
     both = trajectory.join([a, b])
@@ -105,7 +103,7 @@ def fastest_point(motion: trajectory.Trajectory, count: int) -> float:
     return float(np.linalg.norm(np.diff(placed, axis=0), axis=2).max() / (times[1] - times[0]))
 
 
-def test_no_point_of_flange_tool_or_part_is_faster_than_allowed_in_free_moves(arm: ArmKinematics) -> None:
+def test_no_point_of_flange_tool_or_part_is_faster_than_allowed_in_free_moves(arm: ArmKinematics):
     generator = np.random.default_rng(9)
     solids = collision.tool_bodies((0.070, 0.036, 0.020), FLANGE_FROM_PART)
     limits = JointLimits(speed=(1.6,) * 6, acceleration=(3.0,) * 6, jerk=(20.0,) * 6)

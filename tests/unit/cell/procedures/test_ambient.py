@@ -37,11 +37,11 @@ def cell() -> VirtualCell:
 
 
 @pytest.mark.parametrize(("level", "share"), [(5, 1.0), (MOST_DN, 1.0), (200, 0.5), (255, 0.25)])
-def test_a_picture_that_is_too_bright_asks_for_a_shorter_exposure(level: float, share: float) -> None:
+def test_a_picture_that_is_too_bright_asks_for_a_shorter_exposure(level: float, share: float):
     assert bearable(frame(level)) == pytest.approx(share * 1e-3)
 
 
-def test_a_camera_exposes_no_longer_than_the_light_allows_until_the_next_job(cell: VirtualCell) -> None:
+def test_a_camera_exposes_no_longer_than_the_light_allows_until_the_next_job(cell: VirtualCell):
     camera, devices = cell.devices.scan_camera, cell.devices
     assert not devices.bright and meet_light(devices) == ()
     shorten(camera, 0.1234e-3)
@@ -55,18 +55,18 @@ def test_a_camera_exposes_no_longer_than_the_light_allows_until_the_next_job(cel
     assert camera.grab().exposure == pytest.approx(2e-3)
 
 
-def test_a_camera_that_cannot_expose_so_briefly_refuses_and_names_the_light(cell: VirtualCell) -> None:
+def test_a_camera_that_cannot_expose_so_briefly_refuses_and_names_the_light(cell: VirtualCell):
     with pytest.raises(RefusedError, match=r"ambient light whitens the pictures of scan_camera.*as short as 0\.0"):
         shorten(cell.devices.scan_camera, 1e-6)
 
 
-def test_the_exposure_follows_what_the_camera_sees(cell: VirtualCell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_exposure_follows_what_the_camera_sees(cell: VirtualCell, monkeypatch):
     camera = cell.devices.scan_camera
     monkeypatch.setattr(camera, "grab", lambda: frame(1e6 * camera.longest_exposure, camera.longest_exposure))
     assert adapted(camera, frame(255.0, 2e-3)).exposure == pytest.approx(0.12e-3)
 
 
-def test_a_photograph_that_is_refused_and_partly_white_is_taken_again(cell: VirtualCell) -> None:
+def test_a_photograph_that_is_refused_and_partly_white_is_taken_again(cell: VirtualCell):
     camera, taken = cell.devices.target_camera, []
     camera.configure(8e-3, 10.0)
 
@@ -83,7 +83,7 @@ def test_a_photograph_that_is_refused_and_partly_white_is_taken_again(cell: Virt
     assert len(taken) == 1
 
 
-def test_a_line_that_shows_in_few_rows_is_hidden() -> None:
+def test_a_line_that_shows_in_few_rows_is_hidden():
     lit = frame(110.0)
     require_line(np.full(100, 0.4), lit, np.full(50, 9.0))
     with pytest.raises(RefusedError, match=r"110 of 255 .* exposure of 1\.00 ms.*9 above it in 10 %") as refused:
@@ -92,7 +92,7 @@ def test_a_line_that_shows_in_few_rows_is_hidden() -> None:
     assert refused.value.numbers[0].value == pytest.approx(10.0)
 
 
-def test_white_pictures_of_a_bright_sweep_are_counted_and_not_looked_at() -> None:
+def test_white_pictures_of_a_bright_sweep_are_counted_and_not_looked_at():
     camera = CameraModel(640, 480, 1667.0, 1667.0, 319.5, 239.5, (0.0, 0.0, 0.0, 0.0, 0.0))
     plane = LightPlane.of((1.0, 0.0, -1 / 3.5), -0.035)
     geometry = ScanGeometry(camera, plane, np.array([1.0, 0.0, 0.0]), pin.SE3.Identity())

@@ -11,7 +11,7 @@ from lab.bench.job.whole_job import JobRecord
 from tests.support.report_runs import pot
 
 
-def test_the_stated_bound_is_the_closed_form_for_a_round_error(placed_pot: JobRecord) -> None:
+def test_the_stated_bound_is_the_closed_form_for_a_round_error(placed_pot: JobRecord):
     job, nominal = pot()
     sigma = 5e-5
     round_error = np.diag([sigma**2] * 3 + [1e-20] * 3)
@@ -24,7 +24,7 @@ def test_the_stated_bound_is_the_closed_form_for_a_round_error(placed_pot: JobRe
     assert twice["d"] == pytest.approx(2 * bound["d"], rel=1e-6)
 
 
-def test_the_bound_is_in_the_surfaces_axes(placed_pot: JobRecord) -> None:
+def test_the_bound_is_in_the_surfaces_axes(placed_pot: JobRecord):
     job, nominal = pot()
     found = placed_pot.results["invert_pose"]
     along_x = found.base_from_surface.rotation[:, 0]

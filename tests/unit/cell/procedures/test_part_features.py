@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -38,7 +37,7 @@ def sure(section: FeatureSection, seen: pin.SE3, belongs: pin.SE3 | None = None)
     return FeatureSeen.of(section, seen, where, motions=np.zeros((10, 6)), percent=PERCENT)
 
 
-def test_a_flat_counts_along_its_normal_and_the_others_across_their_direction() -> None:
+def test_a_flat_counts_along_its_normal_and_the_others_across_their_direction():
     off = from_parts((0.3e-3, 0.4e-3, 1.2e-3))
     assert sure(feature("flat", (0, 0, 1)), off).off == pytest.approx(1.2e-3)
     assert sure(feature("flat", (0, 0, 0.5)), off).off == pytest.approx(1.2e-3), "of any length"
@@ -48,14 +47,14 @@ def test_a_flat_counts_along_its_normal_and_the_others_across_their_direction() 
     assert sure(feature("flat", (0.6, 0.8, 0)), off).off == pytest.approx(0.5e-3)
 
 
-def test_a_turned_part_moves_a_feature_by_its_arm() -> None:
+def test_a_turned_part_moves_a_feature_by_its_arm():
     turned = from_parts((0.0, 0.0, 0.0), pin.exp3(np.array([0.0, 0.0, 2e-3])))
     # 20 mm from the origin: 40 um to the side, and next to nothing along the arm.
     assert sure(feature("flat", (0, 1, 0)), turned).off == pytest.approx(40e-6, rel=1e-3)
     assert sure(feature("flat", (1, 0, 0)), turned).off < 1e-7
 
 
-def test_axes_are_the_parts_and_turn_with_its_place() -> None:
+def test_axes_are_the_parts_and_turn_with_its_place():
     belongs = from_parts((0.01, 0.0, 0.0), pin.exp3(np.array([0.0, 0.0, np.pi / 2])))
     seen = from_parts((0.01, 0.3e-3, 0.0), belongs.rotation)
     # The part's x axis lies along the surface's y axis.
@@ -66,7 +65,7 @@ def test_axes_are_the_parts_and_turn_with_its_place() -> None:
     assert np.allclose(projection @ projection, projection) and np.trace(projection) == pytest.approx(2.0)
 
 
-def test_the_bound_of_a_feature_is_what_chance_adds_at_its_arm() -> None:
+def test_the_bound_of_a_feature_is_what_chance_adds_at_its_arm():
     rng = np.random.default_rng(3)
     shifts = np.concatenate([20e-6 * rng.standard_normal((200_000, 3)), np.zeros((200_000, 3))], axis=1)
     flat, hole = feature("flat", (0, 0, 1)), feature("hole", (0, 0, 1))
@@ -83,7 +82,7 @@ def test_the_bound_of_a_feature_is_what_chance_adds_at_its_arm() -> None:
     assert json.loads(json.dumps(lifted.as_dict()))["bound_mm"] == round(1e3 * lifted.bound, 4)
 
 
-def test_what_the_points_about_a_feature_say_by_themselves_counts_where_the_drawing_does_not_explain_it() -> None:
+def test_what_the_points_about_a_feature_say_by_themselves_counts_where_the_drawing_does_not_explain_it():
     here, still = pin.SE3.Identity(), np.zeros((10, 6))
     worn, inside = Span(-0.25e-3, -0.15e-3), Span(-0.05e-3, 0.05e-3)
 
@@ -111,7 +110,7 @@ def test_what_the_points_about_a_feature_say_by_themselves_counts_where_the_draw
     assert not edge.measured.kept and edge.as_dict()["own_farther_mm"] == [0.4, 0.6]
 
 
-def test_each_kind_of_feature_is_asked_for_what_its_points_tell() -> None:
+def test_each_kind_of_feature_is_asked_for_what_its_points_tell():
     """A plate with a hole that lies .8 mm aside."""
     at = tuple(f"{1e3 * value} mm" for value in (*PLACE, 0.0))
     named = (feature("hole", (0, 0, 1), at), feature("edge", (0, 1, 0), ("20 mm", "0 mm", "0 mm")))
@@ -136,7 +135,7 @@ def test_each_kind_of_feature_is_asked_for_what_its_points_tell() -> None:
         ({"name": "a/b"}, "is no name"),
     ],
 )
-def test_what_is_no_feature_is_told(change: dict[str, object], told: str) -> None:
+def test_what_is_no_feature_is_told(change: dict[str, object], told: str):
     table = {"name": "rim", "kind": "edge", "at": ["0 mm", "0 mm", "0 mm"], "axis": [1, 0, 0], "tolerance": "0.3 mm"}
     with pytest.raises(ValidationError, match=told):
         FeatureSection.model_validate(table | change)
@@ -144,7 +143,7 @@ def test_what_is_no_feature_is_told(change: dict[str, object], told: str) -> Non
         PartSection.model_validate({"mesh": "a.ply", "mesh_unit": "m", "feature": [table, table]})
 
 
-def test_features_beside_the_part_and_those_that_nobody_looks_at_are_told_before_anything_moves(tmp_path: Path) -> None:
+def test_features_beside_the_part_and_those_that_nobody_looks_at_are_told_before_anything_moves(tmp_path):
     job, mesh = load_job(job_with_part(tmp_path, "pot", verify="all"))
     on, off = (
         feature("edge", (0, 1, 0), ("0 mm", "0 mm", "5 mm")),

@@ -49,7 +49,7 @@ def part(off: pin.SE3, sigma: float = 10e-6, *, beside: int = 900, weak: tuple[s
     return PlacedPart.of(job, seen, POINTS, STATED)
 
 
-def test_a_shift_is_what_every_point_is_off_by_and_the_bound_what_chance_adds() -> None:
+def test_a_shift_is_what_every_point_is_off_by_and_the_bound_what_chance_adds():
     found = part(moved(0.3e-3), sigma=1e-9)
     assert found.off == pytest.approx(0.3e-3) and found.bound["d"] == pytest.approx(0.3, abs=1e-4)
     assert found.bound["x"] == pytest.approx(0.3, abs=1e-4) and found.bound["z"] < 1e-3
@@ -58,7 +58,7 @@ def test_a_shift_is_what_every_point_is_off_by_and_the_bound_what_chance_adds() 
     assert still.bound["d"] == pytest.approx(1e3 * 10e-6 * scipy.stats.maxwell.ppf(0.999), rel=0.05)
 
 
-def test_a_turn_moves_the_points_as_one_body() -> None:
+def test_a_turn_moves_the_points_as_one_body():
     """Known about y alone: opposite ends go opposite ways, and what lies on the axis stays."""
     sure = np.full(6, 1e-12)
     sure[4] = 1e-3
@@ -80,13 +80,13 @@ def test_a_turn_moves_the_points_as_one_body() -> None:
         (moved(0.2e-3, z=0.2e-3), UNCLEAR),
     ],
 )
-def test_the_first_motion_that_chance_does_not_bring_is_the_cause(off: pin.SE3, likely: str) -> None:
+def test_the_first_motion_that_chance_does_not_bring_is_the_cause(off: pin.SE3, likely: str):
     found = part(off)
     assert found.likely == likely
     assert any(f"most likely {likely}" in note for note in found.notes) == (likely != UNCLEAR)
 
 
-def test_a_part_is_kept_only_where_its_bound_is_inside_both_tolerances() -> None:
+def test_a_part_is_kept_only_where_its_bound_is_inside_both_tolerances():
     assert part(moved(0.5e-3)).in_tolerance(PLACE)
     assert not part(moved(0.5e-3), sigma=0.1e-3).in_tolerance(PLACE), "it may lie farther"
     assert not part(moved(turn=(0.0, 0.0, 0.007))).in_tolerance(PLACE)
@@ -95,7 +95,7 @@ def test_a_part_is_kept_only_where_its_bound_is_inside_both_tolerances() -> None
     assert "It was not corrected: why. See to it" in told
 
 
-def test_what_is_not_seen_moves_nothing_and_is_known_as_stated() -> None:
+def test_what_is_not_seen_moves_nothing_and_is_known_as_stated():
     found = part(moved(1.5e-3, z=0.2e-3), weak=("translation along the x axis of the surface frame",))
     assert found.unseen == ("translation along the x axis of the part frame",)
     assert np.allclose(found.seen.surface_from_part.translation, [0.0, 0.0, 0.2e-3], atol=1e-9)
@@ -105,7 +105,7 @@ def test_what_is_not_seen_moves_nothing_and_is_known_as_stated() -> None:
         PlacedPart.of(JOB, seen, POINTS, STATED)
 
 
-def test_a_part_that_seems_to_go_into_the_surface_may_be_off_by_what_brings_it_out() -> None:
+def test_a_part_that_seems_to_go_into_the_surface_may_be_off_by_what_brings_it_out():
     file = job_path("pot").with_name("pot.ply")
     vertices, faces = read_mesh(file, "m")
     drawn, nominal = body(vertices, faces), NominalSurface(vertices, faces)
@@ -137,7 +137,7 @@ def test_a_part_that_seems_to_go_into_the_surface_may_be_off_by_what_brings_it_o
     assert unseen.over(gap).interference == 0.0, "it was not seen where it lies"
 
 
-def test_of_a_motion_only_what_is_along_the_surface_counts_as_aside() -> None:
+def test_of_a_motion_only_what_is_along_the_surface_counts_as_aside():
     found = along_surface(moved(0.3e-3, -0.2e-3, 0.4e-3, turn=(0.005, -0.004, 0.006)))
     assert np.allclose(found.translation, [0.3e-3, -0.2e-3, 0.0])
     assert np.allclose(pin.log3(found.rotation), [0.0, 0.0, 0.006], atol=1e-6)
@@ -145,7 +145,7 @@ def test_of_a_motion_only_what_is_along_the_surface_counts_as_aside() -> None:
     assert part(from_parts((0.3e-3, 0.4e-3, 0.2e-3))).aside == pytest.approx(0.5e-3)
 
 
-def test_an_edge_that_stands_too_high_is_no_part_in_its_place() -> None:
+def test_an_edge_that_stands_too_high_is_no_part_in_its_place():
     """It lies as it should, and is bent."""
     noise = np.full(3, 0.05e-3)
     along = [Flush(np.zeros((3, 3)), np.array([0.0, 0.1e-3, top]), noise) for top in (0.64e-3, 0.66e-3, -0.66e-3)]
@@ -161,7 +161,7 @@ def test_an_edge_that_stands_too_high_is_no_part_in_its_place() -> None:
     assert any("look along the rest" in note for note in replace(kept, flush=replace(along[0], seen=0.2)).notes)
 
 
-def test_a_feature_out_of_its_own_tolerance_is_no_part_in_its_place() -> None:
+def test_a_feature_out_of_its_own_tolerance_is_no_part_in_its_place():
     """As a whole the part keeps the place's tolerance of .6 mm."""
     table = {"kind": "hole", "at": ["20 mm", "0 mm", "0 mm"], "axis": [0, 0, 1]}
     named = tuple(
@@ -179,7 +179,7 @@ def test_a_feature_out_of_its_own_tolerance_is_no_part_in_its_place() -> None:
     assert [each["name"] for each in features] == ["wide", "narrow"]
 
 
-def test_a_part_that_is_off_its_drawing_about_a_feature_is_told_as_that() -> None:
+def test_a_part_that_is_off_its_drawing_about_a_feature_is_told_as_that():
     """As a whole it lies in its place; one that lies aside as well is told by where it lies."""
     table = {"kind": "flat", "at": ["0 mm", "0 mm", "0 mm"], "axis": [0, 0, 1], "tolerance": "0.3 mm"}
     named = tuple(FeatureSection.model_validate({**table, "name": name}) for name in ("worn", "top"))
@@ -193,13 +193,13 @@ def test_a_part_that_is_off_its_drawing_about_a_feature_is_told_as_that() -> Non
     assert WHOLE.format("flat", "top") in found.notes and WHOLE.format("flat", "worn") not in found.notes
 
 
-def test_moved_to_where_it_belongs_along_the_surface_it_is_as_high_and_as_tilted() -> None:
+def test_moved_to_where_it_belongs_along_the_surface_it_is_as_high_and_as_tilted():
     found = part(moved(0.5e-3, -0.3e-3, 0.2e-3, turn=(0.003, 0.0, 0.004))).not_aside
     assert found.aside < 2e-6 and found.offsets[:, 2].mean() == pytest.approx(0.2e-3, abs=0.02e-3)
     assert np.allclose(found.turn, [0.003, 0.0, 0.0], atol=2e-5)
 
 
-def test_its_figures_are_those_of_its_points() -> None:
+def test_its_figures_are_those_of_its_points():
     off = moved(0.2e-3, -0.1e-3, 0.4e-3, turn=(0.001, -0.002, 0.003))
     found = replace(part(off, sigma=20e-6), before=(0.9e-3, 0.7e-3))
     apart = POINTS @ off.rotation.T + off.translation - POINTS
@@ -222,7 +222,7 @@ def test_its_figures_are_those_of_its_points() -> None:
     assert f"Allowed are 0.6 mm and 6 mrad; it may be as much as {most}" in told
 
 
-def test_what_95_percent_of_its_points_are_known_to() -> None:
+def test_what_95_percent_of_its_points_are_known_to():
     """A shift along one axis alone: of its normal deviate 95 % lie below 1.96 sigma."""
     sure = np.full(6, 1e-12)
     sure[1] = 20e-6

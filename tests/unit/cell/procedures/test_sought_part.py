@@ -22,7 +22,7 @@ def changed(**update: object) -> Job:
     return JOB.model_copy(update=update)
 
 
-def test_a_part_to_be_unloaded_is_sought_by_its_upper_side_where_it_lies() -> None:
+def test_a_part_to_be_unloaded_is_sought_by_its_upper_side_where_it_lies():
     aside = JOB.place.surface_from_part.model_copy(update={"translation": (0.004, 0.0, 0.001)})
     found, file = sought(changed(place=JOB.place.model_copy(update={"surface_from_part": aside})), MESH)
     assert JOB.part is not None and file == Path(JOB.part.mesh)
@@ -36,7 +36,7 @@ def test_a_part_to_be_unloaded_is_sought_by_its_upper_side_where_it_lies() -> No
     assert sought(found, file) == (found, file), "once is enough"
 
 
-def test_a_part_on_one_like_it_is_sought_where_it_lies() -> None:
+def test_a_part_on_one_like_it_is_sought_where_it_lies():
     assert JOB.part is not None
     higher = JOB.place.surface_from_part.model_copy(update={"translation": (0.0, 0.0, 0.02)})
     place = JOB.place.model_copy(update={"surface_from_part": higher})
@@ -46,14 +46,14 @@ def test_a_part_on_one_like_it_is_sought_where_it_lies() -> None:
     assert sought(found, file) == (found, file)
 
 
-def test_other_jobs_seek_their_surface() -> None:
+def test_other_jobs_seek_their_surface():
     for name in ("pot", "shell"):
         job, mesh = load_job(name)
         assert sought(job, mesh) == (job, mesh)
         assert len(nominal_of(job, mesh).triangles) == len(NominalSurface.load(mesh, unit="m").triangles)
 
 
-def test_the_underside_of_a_part_is_the_ground_that_fits_it() -> None:
+def test_the_underside_of_a_part_is_the_ground_that_fits_it():
     assert JOB.part is not None
     part, ground = (NominalSurface.load(file, unit="m") for file in (Path(JOB.part.mesh), MESH))
     below = seen_from_below(part, JOB.place.surface_from_part.se3())
@@ -73,7 +73,7 @@ FAR = Mounting.model_construct(translation=(-1.0, 0.9, 0.0), rotation=(0, 0, 0))
         (changed(nest=JOB.nest and JOB.nest.model_copy(update={"base_from_part": FAR})), r"nest\.base_from_part"),
     ],
 )
-def test_what_keeps_a_part_from_its_nest_is_told_before_anything_moves(job: Job, told: str) -> None:
+def test_what_keeps_a_part_from_its_nest_is_told_before_anything_moves(job: Job, told: str):
     require_fit(JOB, CONFIG, MESH)
     with pytest.raises(ConfigError, match=told):
         require_fit(job, CONFIG, MESH)

@@ -46,8 +46,8 @@ def opened(calibrated_folder: Path) -> Callable[..., Cell]:
 
 
 def test_the_figures_are_those_of_the_runs_and_what_the_parts_have_alike_is_allowed_for(
-    opened: Callable[..., Cell], tmp_path: Path
-) -> None:
+    opened: Callable[..., Cell], tmp_path
+):
     """Each part is gripped otherwise, and lies .3 mm aside in the claw."""
     lines: list[str] = []
     file = job_with_part(tmp_path, "pot", verify="all", half=MIDDLE)
@@ -97,7 +97,7 @@ def test_the_figures_are_those_of_the_runs_and_what_the_parts_have_alike_is_allo
 
 
 @pytest.mark.parametrize(("rule", "refused"), [("", 1), ("skip", 2)])
-def test_after_a_refusal_the_job_decides(opened: Callable[..., Cell], rule: str, refused: int) -> None:
+def test_after_a_refusal_the_job_decides(opened: Callable[..., Cell], rule: str, refused: int):
     with opened(rule, moved=True) as cell:
         assert load_job("own.toml")[0].batch.on_refusal == (rule or "end")
         batch = cell.run_batch("own.toml", 2)
@@ -105,7 +105,7 @@ def test_after_a_refusal_the_job_decides(opened: Callable[..., Cell], rule: str,
     assert batch.figures == ()
 
 
-def test_where_the_job_asks_a_person_goes_on_or_ends_it(opened: Callable[..., Cell]) -> None:
+def test_where_the_job_asks_a_person_goes_on_or_ends_it(opened: Callable[..., Cell]):
     """The second question is answered with the end; nothing is tried before the first is answered."""
     asked: list[str] = []
     with opened("ask", moved=True) as cell:
@@ -125,9 +125,7 @@ def test_where_the_job_asks_a_person_goes_on_or_ends_it(opened: Callable[..., Ce
     assert "after part 2: loading ended: Ann ends it" in batch.reason
 
 
-def test_an_abort_in_the_second_part_leaves_the_first_whole_and_tells_what_was_not_tried(
-    opened: Callable[..., Cell],
-) -> None:
+def test_an_abort_in_the_second_part_leaves_the_first_whole_and_tells_what_was_not_tried(opened: Callable[..., Cell]):
     before: list[dict[str, Any]] = []
     with opened() as cell:
 
@@ -145,7 +143,7 @@ def test_an_abort_in_the_second_part_leaves_the_first_whole_and_tells_what_was_n
     assert read_report(batch.runs[0].folder)["outcome"] == "placed"
 
 
-def test_somebody_lets_this_part_be_the_last(opened: Callable[..., Cell]) -> None:
+def test_somebody_lets_this_part_be_the_last(opened: Callable[..., Cell]):
     """One that is refused by a job that goes on after refusals: none takes less time."""
     with opened("skip", moved=True) as cell:
 
@@ -159,8 +157,8 @@ def test_somebody_lets_this_part_be_the_last(opened: Callable[..., Cell]) -> Non
 
 @pytest.mark.parametrize(("name", "shares"), [("swap", True), ("two-stations", False)])
 def test_items_are_made_ready_once_a_round_and_those_not_tried_are_named(
-    opened: Callable[..., Cell], tmp_path: Path, placed_pot: JobRecord, name: str, shares: bool
-) -> None:
+    opened: Callable[..., Cell], tmp_path, placed_pot: JobRecord, name: str, shares: bool
+):
     jobs, asked, tried = [load_job(f"{name}#{k}")[0] for k in (1, 2)], list[int](), list[int]()
     shared, known = list[bool](), list[tuple[bool, ...]]()
 
@@ -187,8 +185,8 @@ def test_items_are_made_ready_once_a_round_and_those_not_tried_are_named(
 
 @pytest.mark.parametrize(("faults", "held"), [([], False), ([{"code": "arm.protective_stop"}], False), ([], True)])
 def test_no_part_goes_by_a_look_at_the_head_from_before_a_fault_or_a_hold(
-    placed_pot: JobRecord, tmp_path: Path, faults: list[dict[str, str]], held: bool
-) -> None:
+    placed_pot: JobRecord, tmp_path, faults: list[dict[str, str]], held: bool
+):
     control = RunControl()
     if held:
         control.pause()
@@ -211,7 +209,7 @@ def test_no_part_goes_by_a_look_at_the_head_from_before_a_fault_or_a_hold(
         assert _known_after(known, replace(last, results=unseen), each_job=False).look is not None
 
 
-def test_a_count_out_of_range_is_told_with_the_range(opened: Callable[..., Cell], typed: Typed) -> None:
+def test_a_count_out_of_range_is_told_with_the_range(opened: Callable[..., Cell], typed: Typed):
     with opened() as cell:
         for count in (0, 10_001):
             with pytest.raises(ConfigError, match="allowed: 1 to 10000"):
@@ -220,7 +218,7 @@ def test_a_count_out_of_range_is_told_with_the_range(opened: Callable[..., Cell]
     assert (code, "allowed: 1 to 10000" in error) == (2, True), error
 
 
-def test_the_claw_closes_and_the_arm_moves_only_after_a_word_each(opened: Callable[..., Cell], tmp_path: Path) -> None:
+def test_the_claw_closes_and_the_arm_moves_only_after_a_word_each(opened: Callable[..., Cell], tmp_path):
     """As at a cell with real devices: the person holds a part between the fingers at the second question only."""
     asked: list[str] = []
     with opened() as cell:
@@ -247,7 +245,7 @@ def test_the_claw_closes_and_the_arm_moves_only_after_a_word_each(opened: Callab
 
 def test_a_fault_ends_it_whatever_the_job_says_of_refusals_and_the_command_line_shows_it(
     opened: Callable[..., Cell], typed: Typed
-) -> None:
+):
     opened("skip").close()
     words = ("dry-run", "-c", "cell.toml", "-j", "own.toml", "--clock", "virtual", "--seed", "2", "--count", "2")
     code, out, error = typed(*words, "--inject", "arm.emergency_stop@drive_to_target:40%")
@@ -260,7 +258,7 @@ def test_a_fault_ends_it_whatever_the_job_says_of_refusals_and_the_command_line_
     assert typed(*words, "--until", "board_photo")[0] == 2
 
 
-def test_a_dry_run_that_would_ask_where_nobody_is_is_refused(here: Path, typed: Typed) -> None:
+def test_a_dry_run_that_would_ask_where_nobody_is_is_refused(here: Path, typed: Typed):
     """No terminal is here: the batch would wait for ever."""
     (here / "pot.ply").write_bytes(job_path("pot").with_suffix(".ply").read_bytes())
     (here / "asks.toml").write_text(f'{job_path("pot").read_text(encoding="utf-8")}\n[batch]\non_refusal = "ask"\n')

@@ -13,13 +13,13 @@ from drivers.errors import CellError
 from tests.unit.cell.config.calibrations.test_store import DEVICES
 
 
-def test_a_calibration_belongs_to_the_arm_the_rail_and_both_cameras() -> None:
+def test_a_calibration_belongs_to_the_arm_the_rail_and_both_cameras():
     """An exchanged one of these is another cell: each is asked itself."""
     devices = VirtualCell(load_config(None), 1).devices
     assert serial_numbers(devices) == {name: getattr(devices, name).identity().serial for name in DEVICES}
 
 
-def test_nothing_moves_where_a_calibration_cannot_be_stored(here: Path) -> None:
+def test_nothing_moves_where_a_calibration_cannot_be_stored(here: Path):
     with Cell.open(sim="all", clock="virtual") as cell:
         (here / "calibrations").touch()
         before = cell.devices.arm.state().joints
@@ -28,7 +28,7 @@ def test_nothing_moves_where_a_calibration_cannot_be_stored(here: Path) -> None:
         assert (cell.devices.arm.state().joints == before).all()
 
 
-def test_a_disk_that_takes_an_empty_file_only_is_full(tmp_path: Path) -> None:
+def test_a_disk_that_takes_an_empty_file_only_is_full(tmp_path):
     most = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, most[1]))
     try:

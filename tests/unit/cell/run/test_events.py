@@ -12,7 +12,7 @@ def progress(step: str, fraction: float) -> Event:
     return Event("progress", step, {"fraction": fraction, "text": ""})
 
 
-def test_the_newest_progress_wins_and_nothing_else_is_lost() -> None:
+def test_the_newest_progress_wins_and_nothing_else_is_lost():
     events = Subscription()
     events.put(Event("step_started", "laser_sweep", {"attempt": 1}))
     for count in range(5000):
@@ -25,7 +25,7 @@ def test_the_newest_progress_wins_and_nothing_else_is_lost() -> None:
     assert got[1].fraction == 4999 / 5000
 
 
-def test_a_subscriber_that_never_reads_holds_a_bounded_number_of_events() -> None:
+def test_a_subscriber_that_never_reads_holds_a_bounded_number_of_events():
     events = Subscription()
     for count in range(3 * MOST_WAITING):
         events.put(Event("note", "place", {"count": count}))
@@ -33,7 +33,7 @@ def test_a_subscriber_that_never_reads_holds_a_bounded_number_of_events() -> Non
     assert len(list(events)) == MOST_WAITING
 
 
-def test_a_listener_that_comes_late_hears_what_was_and_a_run_that_has_ended_ends_it() -> None:
+def test_a_listener_that_comes_late_hears_what_was_and_a_run_that_has_ended_ends_it():
     def work(run: Run[int]) -> int:
         run.notify(Event("step_started", "place", {"attempt": 1}))
         run.notify(Event("run_ended", None, {"outcome": "placed", "reason": ""}))
@@ -44,7 +44,7 @@ def test_a_listener_that_comes_late_hears_what_was_and_a_run_that_has_ended_ends
     assert [type(event) for event in run.events()] == [StepStarted, RunEnded]
 
 
-def test_an_observer_that_sleeps_does_not_slow_the_run() -> None:
+def test_an_observer_that_sleeps_does_not_slow_the_run():
     heard: list[Event] = []
     go_on = threading.Event()
 
@@ -62,7 +62,7 @@ def test_an_observer_that_sleeps_does_not_slow_the_run() -> None:
     assert heard[-1].data["fraction"] == 199 / 200
 
 
-def test_an_observer_that_fails_is_named_and_told_nothing_more() -> None:
+def test_an_observer_that_fails_is_named_and_told_nothing_more():
     def observer(event: Event) -> None:
         raise OSError("the terminal is gone")
 
@@ -72,7 +72,7 @@ def test_an_observer_that_fails_is_named_and_told_nothing_more() -> None:
     assert told.failure == "OSError: the terminal is gone"
 
 
-def test_every_event_has_its_time() -> None:
+def test_every_event_has_its_time():
     before = time.time()
     events = Subscription()
     events.put(progress("place", 0.5))

@@ -27,7 +27,7 @@ from drivers.errors import CellError, ConfigError
 from statemachine.journal import Journal
 
 
-def test_runs_are_found_by_name_id_or_as_the_newest(tmp_path: Path) -> None:
+def test_runs_are_found_by_name_id_or_as_the_newest(tmp_path):
     root = tmp_path / "runs"
     with pytest.raises(ConfigError, match="no run at all"):
         find_run(root, None)
@@ -45,7 +45,7 @@ def test_runs_are_found_by_name_id_or_as_the_newest(tmp_path: Path) -> None:
     assert find_run(root, str(tmp_path / "latest")) == find_run(root, str(second / ".." / second.name)) == second
 
 
-def test_a_run_without_a_report_tells_what_its_journal_does(tmp_path: Path) -> None:
+def test_a_run_without_a_report_tells_what_its_journal_does(tmp_path):
     folder = new_run(tmp_path / "runs")
     journal = Journal(folder, folder.name, {"job": "pot"})
     journal.step_started("drive_to_target", 1)
@@ -63,7 +63,7 @@ def test_a_run_without_a_report_tells_what_its_journal_does(tmp_path: Path) -> N
     assert "it was changed" in run_row(folder)["reason"]
 
 
-def test_what_is_going_on_is_found_and_what_has_ended_or_died_is_not(tmp_path: Path) -> None:
+def test_what_is_going_on_is_found_and_what_has_ended_or_died_is_not(tmp_path):
     root = tmp_path / "runs"
     with pytest.raises(ConfigError, match="nothing is going on"):
         find_going(root, None)
@@ -80,7 +80,7 @@ def test_what_is_going_on_is_found_and_what_has_ended_or_died_is_not(tmp_path: P
     assert (find_run(root, None, "job"), find_run(root, None, "calibration")) == (dead, ended)
 
 
-def test_what_a_run_waits_for_is_read_from_its_journal(tmp_path: Path) -> None:
+def test_what_a_run_waits_for_is_read_from_its_journal(tmp_path):
     folder = new_run(tmp_path / "runs")
     journal = Journal(folder, folder.name)
     assert awaited_word(folder) is None
@@ -103,13 +103,13 @@ def two(here: Path) -> list[Journal]:
     return sorted([begun(here / "runs"), begun(here / "runs")], key=lambda journal: journal.run)
 
 
-def test_of_two_that_go_on_one_has_to_be_named(here: Path, two: list[Journal]) -> None:
+def test_of_two_that_go_on_one_has_to_be_named(here: Path, two: list[Journal]):
     with pytest.raises(ConfigError, match="more than one is going on"):
         find_going(here / "runs", None)
     assert find_going(here / "runs", two[0].run) == two[0].path.parent
 
 
-def test_a_time_of_maintenance_takes_no_requests_and_keeps_no_run_from_being_asked(tmp_path: Path) -> None:
+def test_a_time_of_maintenance_takes_no_requests_and_keeps_no_run_from_being_asked(tmp_path):
     job, maintenance = begun(tmp_path), begun(tmp_path, "maintenance")
     assert is_going(maintenance.path.parent)
     assert find_going(tmp_path, None) == job.path.parent
@@ -117,7 +117,7 @@ def test_a_time_of_maintenance_takes_no_requests_and_keeps_no_run_from_being_ask
         find_going(tmp_path, maintenance.run)
 
 
-def test_one_that_cannot_be_asked_keeps_no_other_from_being_asked_to_end(two: list[Journal]) -> None:
+def test_one_that_cannot_be_asked_keeps_no_other_from_being_asked_to_end(two: list[Journal]):
     first, other = two
     with sqlite3.connect(first.path.parent / "journal.sqlite") as base:
         base.execute("DROP TABLE requests")
@@ -127,9 +127,7 @@ def test_one_that_cannot_be_asked_keeps_no_other_from_being_asked_to_end(two: li
     assert [request.kind for request in other.take_requests()] == ["abort"]
 
 
-def test_a_run_that_ended_as_the_others_were_asked_to_end_is_no_failure(
-    two: list[Journal], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_ended_as_the_others_were_asked_to_end_is_no_failure(two: list[Journal], monkeypatch):
     said = []
 
     def echo(line: str) -> None:
@@ -141,7 +139,7 @@ def test_a_run_that_ended_as_the_others_were_asked_to_end_is_no_failure(
     assert said == [f"asked {two[0].run} to end", f"{two[1].run} has ended meanwhile"]
 
 
-def test_a_process_that_took_over_the_number_of_a_dead_one_is_not_the_run(tmp_path: Path) -> None:
+def test_a_process_that_took_over_the_number_of_a_dead_one_is_not_the_run(tmp_path):
     """It lives, and has not this journal open."""
     folder = new_run(tmp_path / "runs")
     Journal(folder, folder.name, {"kind": "job", "pid": os.getppid()}).close()
@@ -149,7 +147,7 @@ def test_a_process_that_took_over_the_number_of_a_dead_one_is_not_the_run(tmp_pa
 
 
 @pytest.mark.parametrize("days", [-30, 30])
-def test_a_clock_that_was_set_does_not_end_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, days: int) -> None:
+def test_a_clock_that_was_set_does_not_end_a_run(tmp_path, monkeypatch, days: int):
     folder, now = new_run(tmp_path / "runs"), time.time()
     with monkeypatch.context() as set_to:
         set_to.setattr("time.time", lambda: now + days * 86400.0)
@@ -159,7 +157,7 @@ def test_a_clock_that_was_set_does_not_end_a_run(tmp_path: Path, monkeypatch: py
     assert not is_going(folder)
 
 
-def test_the_newest_run_is_the_last_whatever_the_clock_says(tmp_path: Path) -> None:
+def test_the_newest_run_is_the_last_whatever_the_clock_says(tmp_path):
     """Summer time ends, or the clock is set back: names go on where they were."""
     (tmp_path / "20991231T235959-ffff").mkdir()
     made = [new_run(tmp_path) for _ in range(3)]
@@ -167,7 +165,7 @@ def test_the_newest_run_is_the_last_whatever_the_clock_says(tmp_path: Path) -> N
     assert find_run(tmp_path, None) == made[-1]
 
 
-def test_what_is_logged_in_a_run_stands_in_its_folder(tmp_path: Path) -> None:
+def test_what_is_logged_in_a_run_stands_in_its_folder(tmp_path):
     with run_log(tmp_path):
         logging.getLogger("cell.run").warning("the lamp flickers")
     logging.getLogger("cell.run").warning("after it")
@@ -175,9 +173,7 @@ def test_what_is_logged_in_a_run_stands_in_its_folder(tmp_path: Path) -> None:
     assert "the lamp flickers" in told and "after it" not in told
 
 
-def test_a_log_that_cannot_be_written_ends_nothing(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_that_cannot_be_written_ends_nothing(tmp_path, capfd, monkeypatch):
     """Nor does it take the place of what went wrong. /dev/full is a disk without room."""
     # What commands of other tests show lies with the logger as well.
     monkeypatch.setattr(logging.getLogger("cell"), "handlers", [])
@@ -188,7 +184,7 @@ def test_a_log_that_cannot_be_written_ends_nothing(
     assert capfd.readouterr().err == ""
 
 
-def test_a_folder_that_nothing_can_be_written_into_goes_again_and_hides_no_run(tmp_path: Path) -> None:
+def test_a_folder_that_nothing_can_be_written_into_goes_again_and_hides_no_run(tmp_path):
     with pytest.raises(CellError, match="`df -h` tells"), new_folder(tmp_path) as folder:
         raise OSError(28, f"No space left on device: {folder}")
     assert list_runs(tmp_path) == []

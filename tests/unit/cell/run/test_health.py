@@ -46,7 +46,7 @@ def series(values: list[list[float]], limit: float = 0.18) -> DriftSeries:
     return DriftSeries("head", "mm", np.arange(float(len(values))), np.array(values), limit)
 
 
-def test_what_scatters_does_not_creep_and_its_mean_counts() -> None:
+def test_what_scatters_does_not_creep_and_its_mean_counts():
     rng = np.random.default_rng(4)
     for jobs in (5, 12):
         found = [series((0.03 * rng.normal(size=(jobs, 3)) + [0.05, 0.0, 0.0]).tolist()) for _ in range(500)]
@@ -54,7 +54,7 @@ def test_what_scatters_does_not_creep_and_its_mean_counts() -> None:
         assert max(one.now for one in found) < 0.16
 
 
-def test_what_creeps_is_told_with_the_day_on_which_the_limit_is_reached() -> None:
+def test_what_creeps_is_told_with_the_day_on_which_the_limit_is_reached():
     """0.01 mm a day from nothing, over nine days: 0.18 mm nine days later."""
     rng = np.random.default_rng(5)
     along = np.array([0.6, 0.8, 0.0])
@@ -66,19 +66,19 @@ def test_what_creeps_is_told_with_the_day_on_which_the_limit_is_reached() -> Non
     assert series([[0.2, 0.0, 0.0]] * 6, limit=0.21).days_left is None
 
 
-def test_one_that_comes_back_reaches_the_limit_on_its_other_side() -> None:
+def test_one_that_comes_back_reaches_the_limit_on_its_other_side():
     found = series([[0.10 - 0.01 * day] for day in range(8)])
     assert found.now == pytest.approx(0.03, abs=1e-6) and found.days_left == pytest.approx(21.0, rel=1e-6)
 
 
-def test_four_jobs_make_no_trend_and_nor_do_five_of_one_morning() -> None:
+def test_four_jobs_make_no_trend_and_nor_do_five_of_one_morning():
     found = series([[0.01 * day, 0.0, 0.0] for day in range(4)])
     assert found.a_day == 0.0 and found.now == pytest.approx(0.02) and found.last == 0.03
     morning = series([[0.01 * job, 0.0, 0.0] for job in range(6)])
     assert morning.a_day > 0.0 and replace(morning, days=morning.days / 10.0).a_day == 0.0
 
 
-def test_a_step_is_no_trend_and_counts_at_once() -> None:
+def test_a_step_is_no_trend_and_counts_at_once():
     """Thirty jobs, of which the last three lie 0.3 mm off; and 0.15 mm for a long time, which does not go on."""
     rng = np.random.default_rng(6)
     bumped = series((0.01 * rng.normal(size=(30, 3)) + [[0.3 * (day >= 27), 0.0, 0.0] for day in range(30)]).tolist())
@@ -87,7 +87,7 @@ def test_a_step_is_no_trend_and_counts_at_once() -> None:
     assert stays.a_day == 0.0 and stays.now == pytest.approx(0.15, abs=0.03) and stays.days_left is None
 
 
-def test_the_jobs_since_the_newest_calibration_count(tmp_path: Path) -> None:
+def test_the_jobs_since_the_newest_calibration_count(tmp_path):
     job(tmp_path, -3.0, [9.0, 9.0, 9.0], calibration_date="2026-10-01 00:00:00")
     names = [job(tmp_path, day, [0.03, 0.04, 0.0]) for day in range(6)]
     job(tmp_path, 6.0)
@@ -101,7 +101,7 @@ def test_the_jobs_since_the_newest_calibration_count(tmp_path: Path) -> None:
     assert found.days_left == pytest.approx(23.0) and found.due == "a calibration is due in 23.0 days, by its age"
 
 
-def test_a_look_that_parts_share_counts_once(tmp_path: Path) -> None:
+def test_a_look_that_parts_share_counts_once(tmp_path):
     """Of a batch, only the first part looked; nobody forgot to."""
     job(tmp_path, 0.0, [0.0, 0.0, 0.0])
     for part in range(3):
@@ -111,14 +111,14 @@ def test_a_look_that_parts_share_counts_once(tmp_path: Path) -> None:
     assert [len(one.days) for one in found.series] == [1, 1, 1]
 
 
-def test_a_creeping_head_is_due_before_its_calibration_is_old(tmp_path: Path) -> None:
+def test_a_creeping_head_is_due_before_its_calibration_is_old(tmp_path):
     for day in range(10):
         job(tmp_path, day, [0.01 * day, 0.0, 0.0])
     found = health(tmp_path, tmp_path / "calibrations", MAX_AGE_S, MADE + dt.timedelta(days=9))
     assert found.due == "a calibration is due in 9.0 days: head, joints or board creeps 0.010 mm a day"
 
 
-def test_what_was_refused_because_it_moved_is_due_now_until_a_job_passes_its_look_again(tmp_path: Path) -> None:
+def test_what_was_refused_because_it_moved_is_due_now_until_a_job_passes_its_look_again(tmp_path):
     job(tmp_path, 0.0, [0.0, 0.0, 0.0])
     refusal = {"numbers": [{"name": MOVED, "value": 0.4}]}
     refused = job(tmp_path, 1.0, outcome="refused", refusal=refusal, steps=[])
@@ -130,7 +130,7 @@ def test_what_was_refused_because_it_moved_is_due_now_until_a_job_passes_its_loo
     assert (found.moved, found.due_now) == ("", False)
 
 
-def test_after_a_new_calibration_the_jobs_before_it_count_no_more(tmp_path: Path) -> None:
+def test_after_a_new_calibration_the_jobs_before_it_count_no_more(tmp_path):
     name = job(tmp_path, 0.0, outcome="refused", refusal={"numbers": [{"name": MOVED, "value": 0.4}]}, steps=[])
     calibration = made()
     save_calibration(calibration, tmp_path / name / "calibration.json")
@@ -141,7 +141,7 @@ def test_after_a_new_calibration_the_jobs_before_it_count_no_more(tmp_path: Path
     assert found.due == "a calibration is due in 29.0 days, by its age"
 
 
-def test_the_tightest_job_sets_the_limit_and_another_cells_jobs_do_not_count(tmp_path: Path) -> None:
+def test_the_tightest_job_sets_the_limit_and_another_cells_jobs_do_not_count(tmp_path):
     tight = {"off_mm": [0.1, 0.0, 0.0], "place_allowed_mm": 0.06}
     job(tmp_path, 0.0, steps=[{"name": "drive_to_target", "result": {"interim": tight}}])
     job(tmp_path, 1.0, [0.1, 0.0, 0.0])
@@ -158,13 +158,13 @@ def test_the_tightest_job_sets_the_limit_and_another_cells_jobs_do_not_count(tmp
         {"steps": [{"name": "laser_sweep", "result": {"laser_turned_mrad": "much"}}]},
     ],
 )  # fmt: skip
-def test_a_report_that_tells_too_little_is_left_out(tmp_path: Path, spoilt: dict[str, Any]) -> None:
+def test_a_report_that_tells_too_little_is_left_out(tmp_path, spoilt: dict[str, Any]):
     job(tmp_path, 0.0, [0.0, 0.0, 0.0])
     job(tmp_path, 1.0, [0.0, 0.0, 0.0], **spoilt)
     assert health(tmp_path, tmp_path / "calibrations", MAX_AGE_S, MADE).jobs == 1
 
 
-def test_what_is_beyond_its_limit_is_due_now_and_so_is_what_is_old(tmp_path: Path) -> None:
+def test_what_is_beyond_its_limit_is_due_now_and_so_is_what_is_old(tmp_path):
     job(tmp_path, 0.0, [0.3, 0.0, 0.0])
     found = health(tmp_path, tmp_path / "calibrations", MAX_AGE_S, MADE)
     assert found.due == "a calibration is due now: head, joints or board is beyond its limit"
@@ -176,7 +176,7 @@ def test_what_is_beyond_its_limit_is_due_now_and_so_is_what_is_old(tmp_path: Pat
     assert aged.due_now and aged.due == "a calibration is due now: it is 31 days old"
 
 
-def test_a_protective_stop_since_is_named_and_what_is_no_job_is_left_out(tmp_path: Path) -> None:
+def test_a_protective_stop_since_is_named_and_what_is_no_job_is_left_out(tmp_path):
     name = job(tmp_path, 0.0, [0.0, 0.0, 0.0], outcome="faulted", code="arm.protective_stop", reason="arm: stopped")
     job(tmp_path, 1.0, [5.0, 5.0, 5.0], kind="verification")
     write_json(new_run(tmp_path) / "report.json", {"spoilt": True})
@@ -187,7 +187,7 @@ def test_a_protective_stop_since_is_named_and_what_is_no_job_is_left_out(tmp_pat
     assert told["parts"][0]["values"] == [0.0] and told["parts"][0]["days_left"] is None
 
 
-def test_the_command_shows_it_and_ends_with_1_when_a_calibration_is_due(here: Path, typed: Typed) -> None:
+def test_the_command_shows_it_and_ends_with_1_when_a_calibration_is_due(here: Path, typed: Typed):
     code, out, _ = typed("health")
     assert (code, "no job has run yet" in out) == (0, True)
     job(here / "runs", 0.0, [0.3, 0.0, 0.0], outcome="faulted", code="arm.protective_stop", reason="arm: stopped")

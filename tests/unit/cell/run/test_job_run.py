@@ -1,14 +1,10 @@
 """What a job's run gives its starter, and who is told of its events."""
 
-import pytest
-
 from cell.run.job_run import each_of
 from statemachine.step import Event
 
 
-def test_an_observer_that_fails_is_told_nothing_more_and_keeps_no_other_from_listening(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_an_observer_that_fails_is_told_nothing_more_and_keeps_no_other_from_listening(caplog):
     told: list[str] = []
 
     def broken(event: Event) -> None:

@@ -21,7 +21,7 @@ from drivers.interfaces import ArmSafety
         (["vehicle", "-5deg"], Jog("vehicle", "yaw", math.radians(-5))),
     ],
 )
-def test_a_jog_is_read_with_its_unit(words: list[str], expected: Jog) -> None:
+def test_a_jog_is_read_with_its_unit(words: list[str], expected: Jog):
     wish = parse_jog(words[0], words[1:])
     assert (wish.device, wish.axis) == (expected.device, expected.axis)
     assert wish.amount == pytest.approx(expected.amount)
@@ -34,12 +34,12 @@ def test_a_jog_is_read_with_its_unit(words: list[str], expected: Jog) -> None:
      ["rail", "+5mm^9^9"], ["arm", "q", "5mm"], ["tower", "5mm"], ["rail", "-501mm"], ["vehicle", "+0.51m"],
      ["vehicle", "-0.51m"], ["arm", "x", "501mm"], ["arm", "j1", "-91deg"], ["vehicle", "91deg"]],
 )  # fmt: skip
-def test_anything_else_is_refused_with_examples(words: list[str]) -> None:
+def test_anything_else_is_refused_with_examples(words: list[str]):
     with pytest.raises(ConfigError, match="write it like"):
         parse_jog(words[0], words[1:])
 
 
-def test_arm_and_vehicle_are_jogged_beside_each_other_unless_a_person_lifts_that() -> None:
+def test_arm_and_vehicle_are_jogged_beside_each_other_unless_a_person_lifts_that():
     arm, vehicle, rail = Jog("arm", "z", 0.01), Jog("vehicle", "x", 0.1), Jog("rail", "", 0.01)
     assert (needed_for(arm), needed_for(vehicle), needed_for(rail)) == (
         ("arm", "vehicle"), ("vehicle", "arm"), ("rail",),
@@ -62,7 +62,7 @@ def test_arm_and_vehicle_are_jogged_beside_each_other_unless_a_person_lifts_that
 )
 def test_the_program_begins_anew_only_where_it_has_ended(
     code: str, controlled: bool, safety: ArmSafety, recovered: bool | None
-) -> None:
+):
     """`recovered` is None where another fault of the arm is passed on."""
     called: list[bool] = []
 

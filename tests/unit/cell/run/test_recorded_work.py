@@ -36,9 +36,7 @@ def recorded(root: Path, cell: VirtualCell, work: Any) -> tuple[dict[str, Any], 
     return json.loads((run.folder / "report.json").read_text()), run.folder
 
 
-def test_a_refused_calibration_leaves_its_pictures_and_says_which_it_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_refused_calibration_leaves_its_pictures_and_says_which_it_refused(tmp_path, monkeypatch):
     """Its lamp is out: the fine board is seen at no view."""
     views = boards.scan_calibration_views
     monkeypatch.setattr(boards, "scan_calibration_views", lambda *given: views(*given)[:13])
@@ -58,7 +56,7 @@ def test_a_refused_calibration_leaves_its_pictures_and_says_which_it_refused(
     assert all((folder / name).exists() for name in report["last_frames"])
 
 
-def test_what_is_kept_is_the_very_picture(tmp_path: Path) -> None:
+def test_what_is_kept_is_the_very_picture(tmp_path):
     cell = VirtualCell(CONFIG, seed=4, level="ideal")
     pictures: list[np.ndarray] = []
 
@@ -79,7 +77,7 @@ def test_what_is_kept_is_the_very_picture(tmp_path: Path) -> None:
     assert np.array_equal(read_image(folder / name, pictures[0].shape), pictures[0])
 
 
-def test_work_that_looks_at_nothing_leaves_no_folder_for_it(tmp_path: Path) -> None:
+def test_work_that_looks_at_nothing_leaves_no_folder_for_it(tmp_path):
     def work(context: WorkContext) -> None:
         raise RefusedError("not today")
 
@@ -93,9 +91,7 @@ def test_work_that_looks_at_nothing_leaves_no_folder_for_it(tmp_path: Path) -> N
     [(3.0, 0.4, "woke up 400 ms late. The simulated cell keeps 3 times the wall's pace: `--speed 1`"), (3.0, 0.01, ""),
      (1.0, 0.4, "")],
 )  # fmt: skip
-def test_a_refusal_of_a_cell_that_outran_its_computer_says_so(
-    rate: float, late: float, words: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_refusal_of_a_cell_that_outran_its_computer_says_so(rate: float, late: float, words: str, monkeypatch):
     lateness = Lateness()
     lateness.rate = rate
     monkeypatch.setattr(recorded_work, "LATENESS", lateness)

@@ -46,7 +46,7 @@ def cut_short(folder: Path, **other: Any) -> tuple[UnfinishedRun, Path]:
 
 
 @pytest.mark.parametrize("name", ["pot.toml", "pot.ply"])
-def test_a_run_whose_job_was_changed_is_not_resumed(tmp_path: Path, name: str) -> None:
+def test_a_run_whose_job_was_changed_is_not_resumed(tmp_path, name: str):
     run, _ = cut_short(tmp_path)
     assert run.job == str(tmp_path / "pot.toml")
     with (tmp_path / name).open("ab") as file:
@@ -64,9 +64,7 @@ def test_a_run_whose_job_was_changed_is_not_resumed(tmp_path: Path, name: str) -
         ({"simulated": True}, "simulated world"),
     ],
 )
-def test_a_sweep_is_not_read_under_another_calibration_or_configuration(
-    tmp_path: Path, other: dict[str, Any], said: str
-) -> None:
+def test_a_sweep_is_not_read_under_another_calibration_or_configuration(tmp_path, other: dict[str, Any], said: str):
     run, job = cut_short(tmp_path, **other)
     sweep, why = run.sweep(load_job(job)[0], CONFIG, CALIBRATION)
     assert sweep is None
@@ -85,7 +83,7 @@ DECIDED = {"reason": "too few points", "again": "board_photo", "why": "wiped"}
     ],
     ids=["rejected", "failed", "begun again"],
 )
-def test_a_sweep_that_did_not_stay_the_last_word_is_not_used(tmp_path: Path, then: Callable[[Journal], None]) -> None:
+def test_a_sweep_that_did_not_stay_the_last_word_is_not_used(tmp_path, then: Callable[[Journal], None]):
     run, job = cut_short(tmp_path)
     journal = Journal(run.folder, "later", run.info)
     journal.step_ended(journal.step_started("laser_sweep", 1), 1.0, {})
@@ -111,12 +109,12 @@ def placing(folder: Path, *parts: str) -> Path:
 
 
 @pytest.mark.parametrize("parts", [("unknown",), ("unknown", "released"), ("lost",), ("unknown", "releaseb"), (None,)])
-def test_a_part_that_is_not_known_to_be_held_is_looked_at_first(tmp_path: Path, parts: tuple[str, ...]) -> None:
+def test_a_part_that_is_not_known_to_be_held_is_looked_at_first(tmp_path, parts: tuple[str, ...]):
     with pytest.raises(ConfigError, match=r"[Ll]ook (at the part|what has become)"):
         UnfinishedRun.find(placing(tmp_path, *parts))
 
 
-def test_how_a_part_from_its_nest_is_held_is_known_until_it_is_gripped_again(tmp_path: Path) -> None:
+def test_how_a_part_from_its_nest_is_held_is_known_until_it_is_gripped_again(tmp_path):
     told = HeldPart(pin.SE3.Identity(), 1e-8 * np.eye(6)).as_dict()
     run, _ = cut_short(tmp_path)
     journal = Journal(run.folder, "later", run.info)
@@ -156,8 +154,8 @@ def damaged(data: bytes, count: int) -> Iterator[bytes]:
 @pytest.mark.parametrize("older", [False, True])
 @pytest.mark.parametrize("parts", [(), ("unknown", "released")])
 def test_a_damaged_journal_is_an_error_in_our_words_and_never_a_part_that_is_held(
-    tmp_path: Path, parts: tuple[str, ...], older: bool
-) -> None:
+    tmp_path, parts: tuple[str, ...], older: bool
+):
     folder = placing(tmp_path, *parts)
     whole = None if parts else UnfinishedRun.find(folder)
     path = folder / FILE_NAME
@@ -192,7 +190,7 @@ COLUMNS = {
 }
 
 
-def test_a_journal_with_another_type_in_a_row_is_no_traceback(tmp_path: Path) -> None:
+def test_a_journal_with_another_type_in_a_row_is_no_traceback(tmp_path):
     folder = placing(tmp_path, "unknown", "released")
     data = (folder / FILE_NAME).read_bytes()
     for table, column in ((table, column) for table, columns in COLUMNS.items() for column in columns):
@@ -208,7 +206,7 @@ def test_a_journal_with_another_type_in_a_row_is_no_traceback(tmp_path: Path) ->
             assert not is_going(folder)
 
 
-def test_a_changed_mesh_of_the_part_is_a_changed_job(tmp_path: Path) -> None:
+def test_a_changed_mesh_of_the_part_is_a_changed_job(tmp_path):
     job = job_with_part(tmp_path, "pot")
     before, told = job_hash(job), job_source(job)
     assert told["part_mesh"]["file"] == str(tmp_path / "pot-part.ply")
@@ -223,7 +221,7 @@ def test_a_changed_mesh_of_the_part_is_a_changed_job(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("key", ["job_file", "job_hash", "simulated", "seed", "level", "clock", "speed", "until"])
-def test_facts_of_another_type_are_refused_by_name(tmp_path: Path, key: str) -> None:
+def test_facts_of_another_type_are_refused_by_name(tmp_path, key: str):
     run, _ = cut_short(tmp_path)
     Journal(run.folder, "later", {**run.info, key: {"a": 1}}).close()
     with pytest.raises(ConfigError, match=f"tells its {key} as"):
@@ -231,7 +229,7 @@ def test_facts_of_another_type_are_refused_by_name(tmp_path: Path, key: str) -> 
 
 
 @pytest.mark.parametrize("outcome", ["placed", "done", "refused"])
-def test_a_run_that_came_to_its_end_is_not_resumed(tmp_path: Path, outcome: str) -> None:
+def test_a_run_that_came_to_its_end_is_not_resumed(tmp_path, outcome: str):
     """One that was to end after a step would drive on and place."""
     journal = Journal(tmp_path, "run", {"until": "invert_pose"})
     journal.run_ended(outcome, "all steps done")
@@ -240,7 +238,7 @@ def test_a_run_that_came_to_its_end_is_not_resumed(tmp_path: Path, outcome: str)
         UnfinishedRun.find(tmp_path)
 
 
-def test_a_run_that_a_script_looked_at_is_resumed_with_a_script_only(tmp_path: Path) -> None:
+def test_a_run_that_a_script_looked_at_is_resumed_with_a_script_only(tmp_path):
     run, _ = cut_short(tmp_path, scripted=True)
     assert run.info["scripted"]
     with pytest.raises(ConfigError, match="was looked at by a script"):
@@ -262,7 +260,7 @@ def named(run: UnfinishedRun) -> UnfinishedRun:
     return UnfinishedRun.find(run.folder.rename(run.folder.with_name("20261124T120000-aaaa")))
 
 
-def test_a_run_is_resumed_once(tmp_path: Path) -> None:
+def test_a_run_is_resumed_once(tmp_path):
     """Its part is placed by the run that resumed it: the claw may hold the next one since."""
     run = named(cut_short(tmp_path)[0])
     later(run, "20261124T120001-bbbb", "released", resumed_from=run.folder.name)
@@ -279,9 +277,7 @@ def test_a_run_is_resumed_once(tmp_path: Path) -> None:
         ("20261124T115959-bbbb", "released", "cannot be read as a sweep"),
     ],
 )
-def test_a_sweep_from_before_another_part_was_put_down_is_not_used(
-    tmp_path: Path, name: str, part: str, said: str
-) -> None:
+def test_a_sweep_from_before_another_part_was_put_down_is_not_used(tmp_path, name: str, part: str, said: str):
     run = named(cut_short(tmp_path)[0])
     later(run, name, part)
     found = UnfinishedRun.find(run.folder)

@@ -18,7 +18,7 @@ def ask_to_end() -> None:
 
 
 @pytest.mark.parametrize("late", [0.0, 0.2])
-def test_a_signal_at_the_very_end_of_a_job_leaves_its_result_and_is_kept(late: float) -> None:
+def test_a_signal_at_the_very_end_of_a_job_leaves_its_result_and_is_kept(late: float):
     def work(run: Run[int]) -> int:
         run.control.over = True
         ask_to_end()
@@ -30,7 +30,7 @@ def test_a_signal_at_the_very_end_of_a_job_leaves_its_result_and_is_kept(late: f
 
 
 @pytest.mark.parametrize("late", [0.0, 0.2])
-def test_a_signal_as_other_work_ends_ends_the_program_too(late: float) -> None:
+def test_a_signal_as_other_work_ends_ends_the_program_too(late: float):
     def work(run: Run[int]) -> int:
         ask_to_end()
         time.sleep(late)

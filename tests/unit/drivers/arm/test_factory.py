@@ -15,7 +15,7 @@ from tests.support.wire.arm_bench import snapshot
                                                 ("far", "d of a link table"),
                                                 ("status", "not initialised; switch the arm on"),
                                                 ("zeros", "not initialised; switch the arm on")])  # fmt: skip
-def test_kinematics_info_that_is_none_is_refused(change: str, reason: str) -> None:
+def test_kinematics_info_that_is_none_is_refused(change: str, reason: str):
     numbers = [0.1] * 24
     if change == "nan":
         numbers[2] = float("nan")

@@ -49,7 +49,7 @@ class TestContract(CameraContract):
         made.over()
 
 
-def test_pictures_are_played_at_the_pace_at_which_they_were_taken(tmp_path: Path) -> None:
+def test_pictures_are_played_at_the_pace_at_which_they_were_taken(tmp_path):
     clock = Clock(5.0)
     camera = opened(record(tmp_path / "r", [1, 2, 3, 5, 6]), clock)
     with camera.stream() as frames:
@@ -65,7 +65,7 @@ def test_pictures_are_played_at_the_pace_at_which_they_were_taken(tmp_path: Path
         camera.grab()
 
 
-def test_what_is_wrong_with_a_recording_is_named(tmp_path: Path) -> None:
+def test_what_is_wrong_with_a_recording_is_named(tmp_path):
     folder = record(tmp_path / "r", [1, 2, 3])
     good = (folder / "times.csv").read_text()
     for text, words in (
@@ -90,7 +90,7 @@ def test_what_is_wrong_with_a_recording_is_named(tmp_path: Path) -> None:
         opened(tmp_path / "nowhere")
 
 
-def test_another_exposure_or_rate_than_the_recorded_is_refused(tmp_path: Path) -> None:
+def test_another_exposure_or_rate_than_the_recorded_is_refused(tmp_path):
     camera = opened(record(tmp_path / "r", [1, 2, 3]))
     camera.configure(EXPOSURE_S, RATE_HZ)
     with pytest.raises(LimitError, match=r"exposure 20 ms is not that of the recording .*allowed: 5 ms"):
@@ -99,7 +99,7 @@ def test_another_exposure_or_rate_than_the_recorded_is_refused(tmp_path: Path) -
         camera.configure(EXPOSURE_S, 30.0)
 
 
-def test_a_bad_picture_is_refused_by_name_and_the_next_one_comes(tmp_path: Path) -> None:
+def test_a_bad_picture_is_refused_by_name_and_the_next_one_comes(tmp_path):
     folder = record(tmp_path / "r", [1, 2, 3, 4, 5, 6])
     noise = np.random.default_rng(1).integers(0, 255, (48, 64), dtype=np.uint8)
     whole = cv2.imencode(".jpg", noise)[1].tobytes()
@@ -124,14 +124,14 @@ def test_a_bad_picture_is_refused_by_name_and_the_next_one_comes(tmp_path: Path)
     assert read_image(folder / "colour.png").shape == (5, 5)
 
 
-def test_nothing_moves_by_a_recording(tmp_path: Path) -> None:
+def test_nothing_moves_by_a_recording(tmp_path):
     record(tmp_path / "frames", [1, 2])
     config = load_config(named(tmp_path, "folder", f'folder = "{tmp_path / "frames"}"'))
     with pytest.raises(ConfigError, match=r'scan_camera\.driver = "folder" plays recorded pictures, .*rail'):
         connect(config, ("rail", "scan_camera"))
 
 
-def test_a_device_file_without_a_camera_is_named_with_remedies() -> None:
+def test_a_device_file_without_a_camera_is_named_with_remedies():
     make = make_of("camera", "v4l2")
     record = make.record.model_construct(device="/dev/video77", width=640, height=480, pixel_format="YUYV", gain=None)
     with pytest.raises(NotConnectedError, match=r"/dev/video77 is no camera .*v4l2-ctl .*fuser"):

@@ -41,7 +41,7 @@ def queue(capacity: int = 8, check: Callable[[], None] = lambda: None, exposure:
         ({"host_time": 2.0}, "camera.stamp", "in the future: its exposure ends 950.0 ms after the picture came"),
     ],
 )
-def test_a_frame_whose_times_cannot_be_true_ends_the_acquisition(wrong: dict[str, float], code: str, told: str) -> None:
+def test_a_frame_whose_times_cannot_be_true_ends_the_acquisition(wrong: dict[str, float], code: str, told: str):
     """Those before it are handed out; after it none is."""
     frames = queue(exposure=0.01)
     frames.expect(1)
@@ -65,7 +65,7 @@ def test_a_frame_whose_times_cannot_be_true_ends_the_acquisition(wrong: dict[str
 )
 def test_each_gap_in_the_numbers_is_lost_frames_the_first_one_too_if_its_number_is_told(
     first: int | None, come: tuple[int, ...], handed_out: list[int], lost_before: list[int]
-) -> None:
+):
     frames = queue()
     frames.expect(first)
     for number in come:
@@ -78,7 +78,7 @@ def test_each_gap_in_the_numbers_is_lost_frames_the_first_one_too_if_its_number_
     assert frames.lost == sum(lost_before)
 
 
-def test_frames_that_find_it_full_are_lost_and_the_earlier_ones_kept() -> None:
+def test_frames_that_find_it_full_are_lost_and_the_earlier_ones_kept():
     frames = queue(capacity=2)
     frames.expect(1)
     for number in (1, 2, 3, 4):
@@ -89,7 +89,7 @@ def test_frames_that_find_it_full_are_lost_and_the_earlier_ones_kept() -> None:
 
 
 @pytest.mark.parametrize("aborted", [True, False])
-def test_an_end_that_was_asked_for_ends_who_iterates_and_a_stop_is_told(aborted: bool) -> None:
+def test_an_end_that_was_asked_for_ends_who_iterates_and_a_stop_is_told(aborted: bool):
     frames = queue()
     frames.put(frame(1))
     taken: list[int] = []
@@ -110,7 +110,7 @@ def test_an_end_that_was_asked_for_ends_who_iterates_and_a_stop_is_told(aborted:
         frames.next(0.1)
 
 
-def test_a_simulated_camera_that_is_stopped_while_a_frame_is_looked_at_says_so_as_well() -> None:
+def test_a_simulated_camera_that_is_stopped_while_a_frame_is_looked_at_says_so_as_well():
     camera = VirtualCell(load_config(None), seed=4, level="ideal").scan_camera
     camera.configure(0.005, 10.0)
     with camera.stream() as frames, pytest.raises(Aborted):
@@ -118,7 +118,7 @@ def test_a_simulated_camera_that_is_stopped_while_a_frame_is_looked_at_says_so_a
             camera.stop()
 
 
-def test_who_waits_is_told_at_once_that_none_can_come() -> None:
+def test_who_waits_is_told_at_once_that_none_can_come():
     broken = threading.Event()
 
     def check() -> None:

@@ -52,9 +52,7 @@ def bench() -> Iterator[Bench]:
     assert not [thread for thread in threading.enumerate() if thread.name == "scan_camera reader"]
 
 
-def test_a_frame_that_was_exposed_as_for_another_setting_is_refused(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_frame_that_was_exposed_as_for_another_setting_is_refused(bench: Bench, monkeypatch):
     """The camera's sixth frame lies; the five before it are good."""
     bench.camera.configure(0.004, 50.0)
     sent: list[int] = []
@@ -77,7 +75,7 @@ def test_a_frame_that_was_exposed_as_for_another_setting_is_refused(
     bench.camera.grab()
 
 
-def test_a_frame_that_is_lost_while_the_camera_is_examined_is_told_with_a_remedy(bench: Bench) -> None:
+def test_a_frame_that_is_lost_while_the_camera_is_examined_is_told_with_a_remedy(bench: Bench):
     bench.peer.fault("camera.frame_loss")
     found = {reading.what: reading for reading in examine("camera", bench.camera, [0.001], Clock())}
     assert found["frames lost"].value == 1.0
@@ -86,7 +84,7 @@ def test_a_frame_that_is_lost_while_the_camera_is_examined_is_told_with_a_remedy
 
 
 @pytest.mark.wire
-def test_a_grabbed_frame_was_exposed_after_the_call_and_its_time_is_true(bench: Bench) -> None:
+def test_a_grabbed_frame_was_exposed_after_the_call_and_its_time_is_true(bench: Bench):
     bench.camera.configure(exposure=0.004, frame_rate=50.0)
     for _ in range(3):
         called = bench.clock.now()
@@ -99,7 +97,7 @@ def test_a_grabbed_frame_was_exposed_after_the_call_and_its_time_is_true(bench: 
 
 
 @pytest.mark.wire
-def test_a_stream_is_complete_and_its_times_are_true(bench: Bench) -> None:
+def test_a_stream_is_complete_and_its_times_are_true(bench: Bench):
     bench.camera.configure(exposure=0.002, frame_rate=100.0)
     with bench.camera.stream() as stream:
         frames = [stream.next(2.0) for _ in range(100)]
@@ -110,7 +108,7 @@ def test_a_stream_is_complete_and_its_times_are_true(bench: Bench) -> None:
 
 
 @pytest.mark.wire
-def test_lost_frames_are_known(bench: Bench) -> None:
+def test_lost_frames_are_known(bench: Bench):
     bench.camera.configure(exposure=0.002, frame_rate=100.0)
     bench.peer.fault("camera.frame_loss", 2)
     with bench.camera.stream() as stream:
@@ -124,9 +122,7 @@ def test_lost_frames_are_known(bench: Bench) -> None:
 
 
 @pytest.mark.wire
-def test_pictures_that_nobody_takes_are_counted_as_lost_and_not_kept_for_ever(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pictures_that_nobody_takes_are_counted_as_lost_and_not_kept_for_ever(bench: Bench, monkeypatch):
     monkeypatch.setattr("drivers.camera.frame_queue.QUEUE_BYTES", 0)
     bench.camera.configure(exposure=0.002, frame_rate=100.0)
     with bench.camera.stream() as stream:
@@ -138,7 +134,7 @@ def test_pictures_that_nobody_takes_are_counted_as_lost_and_not_kept_for_ever(
 
 
 @pytest.mark.wire
-def test_an_answer_without_a_number_is_a_fault_of_the_protocol(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_answer_without_a_number_is_a_fault_of_the_protocol(bench: Bench, monkeypatch):
     ask = bench.camera._link.request
     wrong: dict[str, object] = {}
 
@@ -163,7 +159,7 @@ def test_an_answer_without_a_number_is_a_fault_of_the_protocol(bench: Bench, mon
 
 
 @pytest.mark.wire
-def test_stop_ends_a_stream_that_waits(bench: Bench) -> None:
+def test_stop_ends_a_stream_that_waits(bench: Bench):
     bench.camera.configure(exposure=0.5, frame_rate=0.5)
     with bench.camera.stream() as stream:
         stream.next(10.0)
@@ -175,7 +171,7 @@ def test_stop_ends_a_stream_that_waits(bench: Bench) -> None:
 
 
 @pytest.mark.wire
-def test_a_silent_camera_is_a_deadline(bench: Bench) -> None:
+def test_a_silent_camera_is_a_deadline(bench: Bench):
     bench.camera.configure(exposure=0.002, frame_rate=100.0)
     with bench.camera.stream() as stream:
         stream.next(1.0)
@@ -188,7 +184,7 @@ def test_a_silent_camera_is_a_deadline(bench: Bench) -> None:
 
 
 @pytest.mark.wire
-def test_what_ended_a_stream_stays_the_error_when_the_camera_does_not_stop(bench: Bench) -> None:
+def test_what_ended_a_stream_stays_the_error_when_the_camera_does_not_stop(bench: Bench):
     fault = DeviceFault("arm", "arm.emergency_stop", "emergency stop", recoverable=False, hint="Release it.")
     with pytest.raises(DeviceFault) as caught, bench.camera.stream():
         bench.peer.fault("camera.silent")
@@ -199,7 +195,7 @@ def test_what_ended_a_stream_stays_the_error_when_the_camera_does_not_stop(bench
 
 
 @pytest.mark.wire
-def test_a_camera_that_dies_is_lost_at_once(bench: Bench) -> None:
+def test_a_camera_that_dies_is_lost_at_once(bench: Bench):
     with bench.camera.stream() as stream:
         stream.next(2.0)
         bench.peer.stop()
@@ -217,7 +213,7 @@ def test_a_camera_that_dies_is_lost_at_once(bench: Bench) -> None:
 
 
 @pytest.mark.wire
-def test_a_second_client_and_a_wrong_size_are_refused(bench: Bench) -> None:
+def test_a_second_client_and_a_wrong_size_are_refused(bench: Bench):
     with pytest.raises(DeviceFault, match="in use by another client"):
         StreamCamera("second", bench.peer.address, clock=Clock())
     assert bench.camera.grab().frame_id > 0
@@ -227,7 +223,7 @@ def test_a_second_client_and_a_wrong_size_are_refused(bench: Bench) -> None:
 
 
 @pytest.mark.wire
-def test_a_port_without_a_camera_is_named() -> None:
+def test_a_port_without_a_camera_is_named():
     with pytest.raises(NotConnectedError, match=r"127\.0\.0\.1:1"):
         StreamCamera("scan_camera", "127.0.0.1:1", clock=Clock())
     with pytest.raises(ConfigError, match="HOST:PORT"):
@@ -235,7 +231,7 @@ def test_a_port_without_a_camera_is_named() -> None:
 
 
 @pytest.mark.wire
-def test_a_peer_of_another_protocol_is_recognised() -> None:
+def test_a_peer_of_another_protocol_is_recognised():
     listener = socket.create_server(("127.0.0.1", 0))
 
     def serve() -> None:
@@ -262,5 +258,5 @@ def test_a_peer_of_another_protocol_is_recognised() -> None:
         ({"ok": False, "error": "what was that?"}, True),
     ],
 )
-def test_what_comes_unasked_answers_nothing(header: dict[str, object], answer: bool) -> None:
+def test_what_comes_unasked_answers_nothing(header: dict[str, object], answer: bool):
     assert answers(header, 7) == answer

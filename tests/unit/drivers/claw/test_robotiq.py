@@ -59,7 +59,7 @@ def bench() -> Iterator[Bench]:
     alive.join()
 
 
-def test_a_part_is_held_because_the_gripper_found_it(bench: Bench) -> None:
+def test_a_part_is_held_because_the_gripper_found_it(bench: Bench):
     """Let go and closed again on nothing, the fingers go all the way: commanded closed, and nothing held."""
     claw = bench.claw()
     assert claw.holding
@@ -77,7 +77,7 @@ def test_a_part_is_held_because_the_gripper_found_it(bench: Bench) -> None:
         claw.ping()
 
 
-def test_fingers_that_are_stopped_too_early_do_not_hold_from_inside(bench: Bench) -> None:
+def test_fingers_that_are_stopped_too_early_do_not_hold_from_inside(bench: Bench):
     """Stopped while closing is no grip of a part that is held by spreading."""
     claw = bench.claw(open_at=255, closed_at=0, inside=True)
     assert not claw.holding
@@ -86,7 +86,7 @@ def test_fingers_that_are_stopped_too_early_do_not_hold_from_inside(bench: Bench
     claw.close()
 
 
-def test_another_client_agrees_with_the_simulated_gripper_and_with_the_driver(bench: Bench) -> None:
+def test_another_client_agrees_with_the_simulated_gripper_and_with_the_driver(bench: Bench):
     host, port = bench.peer.address.split(":")
     claw = bench.claw()
     with RobotiqGripper(host, int(port)) as other:
@@ -102,7 +102,7 @@ def test_another_client_agrees_with_the_simulated_gripper_and_with_the_driver(be
     claw.close()
 
 
-def test_a_fault_is_told_and_nothing_is_held_by_a_gripper_that_has_one(bench: Bench) -> None:
+def test_a_fault_is_told_and_nothing_is_held_by_a_gripper_that_has_one(bench: Bench):
     claw = bench.claw()
     bench.peer.fault("claw.overcurrent")
     for ask in (lambda: claw.holding, claw.grip, claw.release):
@@ -114,7 +114,7 @@ def test_a_fault_is_told_and_nothing_is_held_by_a_gripper_that_has_one(bench: Be
     claw.close()
 
 
-def test_a_lost_connection_changes_nothing_and_the_next_question_makes_it_anew(bench: Bench) -> None:
+def test_a_lost_connection_changes_nothing_and_the_next_question_makes_it_anew(bench: Bench):
     claw = bench.claw()
     bench.peer.fault("claw.link_lost")
     Clock().sleep(0.05)
@@ -125,7 +125,7 @@ def test_a_lost_connection_changes_nothing_and_the_next_question_makes_it_anew(b
     claw.close()
 
 
-def test_who_only_looks_moves_no_finger(bench: Bench) -> None:
+def test_who_only_looks_moves_no_finger(bench: Bench):
     claw = bench.claw(control=False)
     for ask in (claw.grip, claw.release):
         with pytest.raises(InterlockError):
@@ -134,7 +134,7 @@ def test_who_only_looks_moves_no_finger(bench: Bench) -> None:
     claw.close()
 
 
-def test_what_is_no_gripper_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_no_gripper_is_told(monkeypatch):
     monkeypatch.setattr(robotiq, "REPLY_TIMEOUT_S", 0.2)
     silly = TcpServer("silly", lambda link: [link.sendall(b"hello") for _ in iter(lambda: link.recv(99), b"")])  # type: ignore[arg-type, return-value]
     silly.start()

@@ -43,7 +43,7 @@ from drivers.common.addresses import (
         (checked_folder, "~/store", "no folder beside this file"),
     ],
 )
-def test_what_is_no_address_is_refused(check: Callable[[str], str], text: str, says: str) -> None:
+def test_what_is_no_address_is_refused(check: Callable[[str], str], text: str, says: str):
     with pytest.raises(ValueError, match=says):
         check(text)
 
@@ -60,7 +60,7 @@ def test_what_is_no_address_is_refused(check: Callable[[str], str], text: str, s
         (checked_name, "pot no. 7_b"),
     ],
 )
-def test_a_right_address_passes_as_it_is(check: Callable[[str], str], text: str) -> None:
+def test_a_right_address_passes_as_it_is(check: Callable[[str], str], text: str):
     assert check(text) == text
 
 
@@ -80,11 +80,11 @@ def test_a_right_address_passes_as_it_is(check: Callable[[str], str], text: str)
         ("slcan", "/dev/ttyUSB0", 123, "123 kbit/s.*500"),
     ],
 )
-def test_a_bus_that_cannot_be_is_refused(interface: str, channel: str, kbit: float, says: str) -> None:
+def test_a_bus_that_cannot_be_is_refused(interface: str, channel: str, kbit: float, says: str):
     with pytest.raises(ValueError, match=says):
         checked_can(interface, channel, 1e3 * kbit)
 
 
 @pytest.mark.parametrize("channel", ["/dev/ttyUSB0", "/dev/ttyUSB0@115200", "socket://10.0.0.6:3000"])
-def test_a_bus_on_a_serial_line_or_a_socket_passes(channel: str) -> None:
+def test_a_bus_on_a_serial_line_or_a_socket_passes(channel: str):
     checked_can("slcan", channel, 500e3)

@@ -12,7 +12,7 @@ from tests.support.wire.rail_bench import Bench, benched, connect
 pytestmark = pytest.mark.wire
 
 
-def test_limits_are_checked_before_anything_is_sent(homed: Bench) -> None:
+def test_limits_are_checked_before_anything_is_sent(homed: Bench):
     sent = len(homed.rail.statistics.round_trips_s)
     with pytest.raises(LimitError, match=r"position 120 mm is outside 0 mm to 100 mm"):
         homed.rail.move_to(0.12)
@@ -27,12 +27,12 @@ def test_limits_are_checked_before_anything_is_sent(homed: Bench) -> None:
     assert len(homed.rail.statistics.round_trips_s) == sent
 
 
-def test_a_sweep_starts_only_where_its_start_up_fits(homed: Bench) -> None:
+def test_a_sweep_starts_only_where_its_start_up_fits(homed: Bench):
     with pytest.raises(InterlockError, match="sweep_start"):
         homed.rail.sweep(0.03, 0.06, 0.02)
 
 
-def test_stop_overtakes_a_running_motion(homed: Bench) -> None:
+def test_stop_overtakes_a_running_motion(homed: Bench):
     motion = homed.rail.move_to(0.09, speed=0.01)
     with pytest.raises(InterlockError, match="another motion"):
         homed.rail.move_to(0.01)
@@ -50,7 +50,7 @@ def test_stop_overtakes_a_running_motion(homed: Bench) -> None:
     assert homed.carriage() == pytest.approx(0.01, abs=1e-6)
 
 
-def test_a_search_whose_stop_has_no_answer_is_not_told_as_stopped(bench: Bench) -> None:
+def test_a_search_whose_stop_has_no_answer_is_not_told_as_stopped(bench: Bench):
     motion = bench.rail.home()
     for _ in range(100):
         bench.peer.fault("rail.drop_reply")
@@ -73,7 +73,7 @@ def test_a_search_whose_stop_has_no_answer_is_not_told_as_stopped(bench: Bench) 
 )
 def test_a_search_ends_at_the_first_sign_that_the_carriage_goes_elsewhere(
     params: dict[str, Any], told: str, longest: float
-) -> None:
+):
     """By a switch of the other side, by a count that stands, or after the travel and a margin."""
     with benched(4.0, RailParams(**params)) as made:
         begun = made.clock.now()
@@ -87,7 +87,7 @@ def test_a_search_ends_at_the_first_sign_that_the_carriage_goes_elsewhere(
         assert not made.rail.state().homed and not made.rail.state().moving
 
 
-def test_a_rail_is_nudged_before_it_is_homed_and_a_motor_that_turns_backwards_is_turned_round() -> None:
+def test_a_rail_is_nudged_before_it_is_homed_and_a_motor_that_turns_backwards_is_turned_round():
     with benched(params=RailParams(reversed=True)) as made:
         rail, before = made.rail, made.carriage()
         rail.nudge(0.004, 0.02).wait(10.0)

@@ -27,7 +27,7 @@ def raising(error: Exception) -> Callable[[], bool]:
     return arrived
 
 
-def test_a_motion_that_never_arrives_is_halted_and_told() -> None:
+def test_a_motion_that_never_arrives_is_halted_and_told():
     halts: list[str] = []
     with pytest.raises(DeviceFault, match="has not ended after twice that") as caught:
         motion(lambda: False, halts).wait(500.0)
@@ -48,7 +48,7 @@ def test_a_motion_that_never_arrives_is_halted_and_told() -> None:
 )
 def test_what_ends_a_motion_is_told_to_each_who_waits_and_it_is_halted_unless_it_was(
     error: Exception, told: type[CellError], halted: bool
-) -> None:
+):
     halts: list[str] = []
     moving = motion(raising(error), halts)
     for _ in range(2):
@@ -58,7 +58,7 @@ def test_what_ends_a_motion_is_told_to_each_who_waits_and_it_is_halted_unless_it
     assert halts == ["halt"] * halted
 
 
-def test_who_does_not_wait_any_longer_has_it_halted() -> None:
+def test_who_does_not_wait_any_longer_has_it_halted():
     halts: list[str] = []
     there = threading.Event()
     moving = motion(there.is_set, halts, duration=100.0)
@@ -69,14 +69,14 @@ def test_who_does_not_wait_any_longer_has_it_halted() -> None:
     moving.wait(50.0)
 
 
-def test_a_motion_that_is_there_too_soon_went_faster_than_it_was_told() -> None:
+def test_a_motion_that_is_there_too_soon_went_faster_than_it_was_told():
     with pytest.raises(DeviceFault, match=r"at its speed it takes 1e\+04 s at least") as caught:
         motion(lambda: True, [], least=1e4).wait(500.0)
     assert caught.value.code == "rail.too_fast"
     motion(lambda: True, [], least=0.2).wait(500.0)  # too short to be judged
 
 
-def test_ramps_follow_from_speed_and_acceleration() -> None:
+def test_ramps_follow_from_speed_and_acceleration():
     assert run_up_distance(0.2, 0.5) == pytest.approx(0.04)
     assert move_duration(0.2, 0.2, 0.5) == pytest.approx(2 * 0.4 + (0.2 - 0.08) / 0.2)
     assert move_duration(-0.02, 0.2, 0.5) == pytest.approx(2 * np.sqrt(0.02 / 0.5))
@@ -84,7 +84,7 @@ def test_ramps_follow_from_speed_and_acceleration() -> None:
 
 @pytest.mark.wire
 @pytest.mark.parametrize(("lost", "refused"), [(0.03e-3, False), (0.09e-3, True), (-0.09e-3, True)])
-def test_a_count_that_is_off_by_more_than_a_twentieth_of_a_millimetre_is_refused(lost: float, refused: bool) -> None:
+def test_a_count_that_is_off_by_more_than_a_twentieth_of_a_millimetre_is_refused(lost: float, refused: bool):
     with benched(4.0) as made:
         rail, model = made.rail, made.model
         rail.home().wait(20.0)
@@ -106,7 +106,7 @@ def test_a_count_that_is_off_by_more_than_a_twentieth_of_a_millimetre_is_refused
         limited.close()
 
 
-def test_a_stopped_motion_ends_as_its_stop_did() -> None:
+def test_a_stopped_motion_ends_as_its_stop_did():
     stops = Stops()
     with stops.one_more():
         assert not stops.end("rail", 0.005), "nobody knows yet"
@@ -123,9 +123,7 @@ def test_a_stopped_motion_ends_as_its_stop_did() -> None:
 
 @pytest.mark.wire
 @pytest.mark.parametrize(("begin", "way"), [("move_to", 0.09), ("nudge", 0.01)])
-def test_a_start_whose_answer_was_lost_is_stopped(
-    homed: Bench, begin: str, way: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_start_whose_answer_was_lost_is_stopped(homed: Bench, begin: str, way: float, monkeypatch):
     """The drive may have taken it, and nobody would watch that motion."""
     send = homed.rail._send
 

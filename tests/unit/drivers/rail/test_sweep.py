@@ -38,7 +38,7 @@ def errors(line: EvenMotion, speed: float = SPEED) -> Vector:
 
 @pytest.mark.parametrize("speed", [SPEED, -SPEED])
 @pytest.mark.parametrize("seed", range(20))
-def test_the_bound_holds_and_is_a_fraction_of_a_round_trip(seed: int, speed: float) -> None:
+def test_the_bound_holds_and_is_a_fraction_of_a_round_trip(seed: int, speed: float):
     line = EvenMotion.of(*readings(300, 0.0, 0.0, seed, speed))
     assert np.abs(errors(line, speed)).max() <= line.time_bound * (1 + 1e-6)
     assert line.time_bound < 0.00008
@@ -46,7 +46,7 @@ def test_the_bound_holds_and_is_a_fraction_of_a_round_trip(seed: int, speed: flo
 
 @pytest.mark.parametrize("late", [0.02, 0.2])
 @pytest.mark.parametrize("n", [7, 60, 300])
-def test_replies_that_are_all_late_are_known_as_an_unknown_of_half_of_it(n: int, late: float) -> None:
+def test_replies_that_are_all_late_are_known_as_an_unknown_of_half_of_it(n: int, late: float):
     line = EvenMotion.of(*readings(n, late, 1.0, n))
     # The trap: the readings lie on a perfect line, half of the lateness off.
     assert errors(line).mean() == pytest.approx(-late / 2, abs=0.0004)
@@ -55,13 +55,13 @@ def test_replies_that_are_all_late_are_known_as_an_unknown_of_half_of_it(n: int,
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
-def test_as_long_as_some_replies_are_prompt_they_tell_the_time(share: float) -> None:
+def test_as_long_as_some_replies_are_prompt_they_tell_the_time(share: float):
     line = EvenMotion.of(*readings(300, 0.2, share, 5))
     assert np.abs(errors(line)).max() < 0.0002
     assert line.time_bound < 0.002
 
 
-def test_readings_that_contradict_an_even_motion_say_so_and_late_ones_do_not() -> None:
+def test_readings_that_contradict_an_even_motion_say_so_and_late_ones_do_not():
     times, positions, trips = readings(300, 0.0, 0.0, 1)
     stepped = EvenMotion.of(times, positions + np.where(times > 2.0, 0.0005, 0.0), trips)
     assert stepped.unevenness > 0.00003
@@ -71,7 +71,7 @@ def test_readings_that_contradict_an_even_motion_say_so_and_late_ones_do_not() -
 
 @pytest.mark.parametrize("speed", [SPEED, -SPEED])
 @pytest.mark.parametrize("late", [0.0, 0.02])
-def test_what_no_even_motion_explains_is_found_beside_prompt_and_late_replies(speed: float, late: float) -> None:
+def test_what_no_even_motion_explains_is_found_beside_prompt_and_late_replies(speed: float, late: float):
     """A parabola is off the best line by an eighth of its rise, at most; one that round trips explain is not off."""
     times, positions, trips = readings(300, late, 0.5, 3, speed)
     assert EvenMotion.of(times, positions, trips).residual == 0.0
@@ -83,7 +83,7 @@ def test_what_no_even_motion_explains_is_found_beside_prompt_and_late_replies(sp
     assert slight.residual <= 1e-6
 
 
-def test_one_late_sample_does_not_bend_the_line() -> None:
+def test_one_late_sample_does_not_bend_the_line():
     times = np.linspace(10.0, 12.0, 40)
     positions = 0.01 + 0.02 * (times - 10.0)
     trips = np.full(40, 0.001)
@@ -96,7 +96,7 @@ def test_one_late_sample_does_not_bend_the_line() -> None:
 
 @pytest.mark.wire
 @pytest.mark.parametrize(("start", "stop"), [(0.02, 0.06), (0.06, 0.02)])
-def test_a_sweep_knows_its_position_at_any_time_to_some_micrometres(homed: Bench, start: float, stop: float) -> None:
+def test_a_sweep_knows_its_position_at_any_time_to_some_micrometres(homed: Bench, start: float, stop: float):
     speed = 0.04
     homed.rail.move_to(homed.rail.sweep_start(start, stop, speed)).wait(10.0)
     sweep = homed.rail.sweep(start, stop, speed)
@@ -118,7 +118,7 @@ def test_a_sweep_knows_its_position_at_any_time_to_some_micrometres(homed: Bench
 
 
 @pytest.mark.wire
-def test_late_replies_shift_a_sweep_within_the_bound_that_it_states(homed: Bench) -> None:
+def test_late_replies_shift_a_sweep_within_the_bound_that_it_states(homed: Bench):
     start, stop, speed = 0.02, 0.06, 0.005
     homed.rail.move_to(homed.rail.sweep_start(start, stop, speed)).wait(10.0)
     homed.peer.fault("rail.late_reply")
@@ -155,7 +155,7 @@ def sweep(
 
 
 @pytest.mark.parametrize(("start", "stop"), [(0.02, 0.06), (0.06, 0.02)])
-def test_a_sweep_tells_its_place_inside_its_window_only(start: float, stop: float) -> None:
+def test_a_sweep_tells_its_place_inside_its_window_only(start: float, stop: float):
     made = sweep(start=start, stop=stop)
     made.wait(50.0)
     begin, end = made.window
@@ -167,7 +167,7 @@ def test_a_sweep_tells_its_place_inside_its_window_only(start: float, stop: floa
             made.position_at(outside)
 
 
-def test_a_sweep_tells_nothing_before_its_end_nor_after_a_failed_one() -> None:
+def test_a_sweep_tells_nothing_before_its_end_nor_after_a_failed_one():
     there = threading.Event()
     made = sweep(arrived=there.is_set)
     for asked in (lambda: made.window, lambda: made.position_at(101.0), lambda: made.time_bound):
@@ -197,7 +197,7 @@ def test_a_sweep_tells_nothing_before_its_end_nor_after_a_failed_one() -> None:
     ],
     ids=str,
 )
-def test_a_sweep_that_was_not_as_commanded_has_no_window(made: dict[str, float], told: str) -> None:
+def test_a_sweep_that_was_not_as_commanded_has_no_window(made: dict[str, float], told: str):
     ended = sweep(**made)  # type: ignore[arg-type]
     ended.wait(50.0)
     with pytest.raises(DeviceFault) as caught:
@@ -206,7 +206,7 @@ def test_a_sweep_that_was_not_as_commanded_has_no_window(made: dict[str, float],
 
 
 @pytest.mark.parametrize("ran", [0.0192, 0.0208])
-def test_a_velocity_within_what_is_allowed_is_the_one_that_was_measured(ran: float) -> None:
+def test_a_velocity_within_what_is_allowed_is_the_one_that_was_measured(ran: float):
     ended = sweep(ran=ran)
     ended.wait(50.0)
     begin, end = ended.window

@@ -77,7 +77,7 @@ def becomes(value: bool, wired: Wired, relay: int = LASER) -> bool:
     return until(lambda: wired.on[relay] == value, 0.5)
 
 
-def test_laser_and_claw_share_one_board_and_its_port(numato: str, wired: Wired) -> None:
+def test_laser_and_claw_share_one_board_and_its_port(numato: str, wired: Wired):
     laser = BoardLaser(open_board("laser", "laser", "numato", numato, baud=19200), LASER)
     board = open_numato("claw", "claw", numato, baud=19200)
     claw = BoardClaw(board, CLAW, FEEDBACK, active_high=False, clock=Clock())
@@ -96,7 +96,7 @@ def test_laser_and_claw_share_one_board_and_its_port(numato: str, wired: Wired) 
         claw.ping()
 
 
-def test_a_relay_that_sticks_says_so_when_it_is_switched_off_and_when_it_is_closed(numato: str, wired: Wired) -> None:
+def test_a_relay_that_sticks_says_so_when_it_is_switched_off_and_when_it_is_closed(numato: str, wired: Wired):
     laser = BoardLaser(open_board("laser", "laser", "numato", numato, baud=19200), LASER)
     sticks = pytest.raises(DeviceFault, match="shows on after it was switched off")
     with sticks, laser.lit():
@@ -114,7 +114,7 @@ def test_a_relay_that_sticks_says_so_when_it_is_switched_off_and_when_it_is_clos
         laser.ping()
 
 
-def test_a_stop_while_it_is_being_lit_leaves_it_off(numato: str, wired: Wired, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_while_it_is_being_lit_leaves_it_off(numato: str, wired: Wired, monkeypatch):
     """Between two attempts, or before the first."""
     laser = BoardLaser(open_board("laser", "laser", "numato", numato, baud=19200), LASER)
     monkeypatch.setattr(laser, "_off_after_death", laser.stop)
@@ -124,9 +124,7 @@ def test_a_stop_while_it_is_being_lit_leaves_it_off(numato: str, wired: Wired, m
     laser.close()
 
 
-def test_a_close_that_the_board_does_not_hear_can_be_done_again(
-    numato: str, wired: Wired, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_close_that_the_board_does_not_hear_can_be_done_again(numato: str, wired: Wired, monkeypatch):
     laser = BoardLaser(open_board("laser", "laser", "numato", numato, baud=19200), LASER)
     with laser.lit():
         with monkeypatch.context() as mute, pytest.raises(DeadlineError):
@@ -137,7 +135,7 @@ def test_a_close_that_the_board_does_not_hear_can_be_done_again(
     laser.close()
 
 
-def test_the_makers_own_client_agrees_with_the_simulated_board(numato: str, wired: Wired) -> None:
+def test_the_makers_own_client_agrees_with_the_simulated_board(numato: str, wired: Wired):
     client = VendorsClient(numberRelays=8, port=numato, name="usb", timeout=0.1)
     assert (client.version, client.id) == ("00000009", "sim00001")
     client.relay_on(LASER)
@@ -145,12 +143,12 @@ def test_the_makers_own_client_agrees_with_the_simulated_board(numato: str, wire
     assert (client.relay_read(LASER), client.relay_read(5), client.gpio_read(FEEDBACK)) == ("on", "off", "0")
 
 
-def test_a_board_of_another_make_is_told_by_what_it_does_not_answer(lcus: LcusPeer) -> None:
+def test_a_board_of_another_make_is_told_by_what_it_does_not_answer(lcus: LcusPeer):
     with pytest.raises(DeadlineError, match="of this make"):
         open_board("laser", "laser", "numato", str(lcus.pty), baud=9600)
 
 
-def test_a_board_that_cannot_be_asked_is_first_switched_off_and_said_to_be_so(lcus: LcusPeer, wired: Wired) -> None:
+def test_a_board_that_cannot_be_asked_is_first_switched_off_and_said_to_be_so(lcus: LcusPeer, wired: Wired):
     wired.on[LASER] = True
     laser = lcus_laser(str(lcus.pty))
     assert becomes(False, wired)
@@ -163,7 +161,7 @@ def test_a_board_that_cannot_be_asked_is_first_switched_off_and_said_to_be_so(lc
     laser.close()
 
 
-def test_after_a_lost_link_nobody_knows_such_a_relay_until_it_is_switched_off(lcus: LcusPeer, wired: Wired) -> None:
+def test_after_a_lost_link_nobody_knows_such_a_relay_until_it_is_switched_off(lcus: LcusPeer, wired: Wired):
     laser = lcus_laser(lcus.url)
     with pytest.raises(DeviceFault) as lost, laser.lit():
         assert becomes(True, wired)
@@ -184,7 +182,7 @@ def test_after_a_lost_link_nobody_knows_such_a_relay_until_it_is_switched_off(lc
     laser.close()
 
 
-def test_what_is_lit_while_it_is_closed_goes_off(numato: str, wired: Wired, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_lit_while_it_is_closed_goes_off(numato: str, wired: Wired, monkeypatch):
     laser = BoardLaser(open_board("laser", "laser", "numato", numato, baud=19200), LASER)
     closer = threading.Thread(target=laser.close)
     waited: list[bool] = []
@@ -201,7 +199,7 @@ def test_what_is_lit_while_it_is_closed_goes_off(numato: str, wired: Wired, monk
     assert waited == [True] and not wired.on[LASER]
 
 
-def test_who_only_looks_sends_nothing(lcus: LcusPeer, wired: Wired) -> None:
+def test_who_only_looks_sends_nothing(lcus: LcusPeer, wired: Wired):
     laser = BoardLaser(LcusBoard(RelayPort("laser", "laser", str(lcus.pty), baud=9600)), LASER, control=False)
     with pytest.raises(InterlockError), laser.lit():
         pass
@@ -222,7 +220,7 @@ with laser.lit():
 
 
 @pytest.mark.parametrize("make", ["numato", "lcus"])
-def test_the_laser_goes_off_when_its_owner_is_killed(make: str, wired: Wired, request: pytest.FixtureRequest) -> None:
+def test_the_laser_goes_off_when_its_owner_is_killed(make: str, wired: Wired, request):
     port = request.getfixturevalue(make)
     url = port if isinstance(port, str) else str(port.pty)
     with subprocess.Popen([sys.executable, "-c", OWNER, make, url], stdout=subprocess.PIPE) as owner:

@@ -19,9 +19,7 @@ from tests.support.wire.other_makes import LCUS, NUMATO, cell
         (({"claw": {**LCUS["laser"]}},), '"lcus" is not one of'),
     ],
 )  # fmt: skip
-def test_a_wrong_table_is_refused_with_key_value_and_what_is_allowed(
-    tables: tuple[dict[str, Any], ...], told: str
-) -> None:
+def test_a_wrong_table_is_refused_with_key_value_and_what_is_allowed(tables: tuple[dict[str, Any], ...], told: str):
     with pytest.raises(ConfigError) as met:
         cell(*tables)
     assert told in str(met.value)

@@ -62,7 +62,7 @@ class Bench(Driven):
 
 
 @pytest.fixture
-def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
+def bench(request) -> Iterator[Bench]:
     made = Bench(request.node.name)
     try:
         made.vehicle.enable()
@@ -73,7 +73,7 @@ def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
         made.peer.stop()
 
 
-def test_the_brake_locks_in_truth_and_then_nothing_drives(bench: Bench) -> None:
+def test_the_brake_locks_in_truth_and_then_nothing_drives(bench: Bench):
     bench.drive_until_fast()
     bench.vehicle.brake()
     bench.until(bench.braked)
@@ -87,7 +87,7 @@ def test_the_brake_locks_in_truth_and_then_nothing_drives(bench: Bench) -> None:
     assert set(sent) == {bytes(8)}
 
 
-def test_a_brake_outside_can_mode_is_not_taken_as_locked(bench: Bench) -> None:
+def test_a_brake_outside_can_mode_is_not_taken_as_locked(bench: Bench):
     """Under the remote control, say, that has taken over from this program and has handed back."""
     vehicle, model = bench.vehicle, bench.peer.model
     vehicle.brake()
@@ -105,7 +105,7 @@ def test_a_brake_outside_can_mode_is_not_taken_as_locked(bench: Bench) -> None:
     assert vehicle.state().braked is True
 
 
-def test_a_velocity_that_nobody_renews_becomes_zero(bench: Bench) -> None:
+def test_a_velocity_that_nobody_renews_becomes_zero(bench: Bench):
     bench.drive_until_fast()
     bench.clock.sleep(DEAD_MAN_S + 0.6)
     bench.bus.frames.clear()
@@ -115,7 +115,7 @@ def test_a_velocity_that_nobody_renews_becomes_zero(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(("speed", "yaw_rate"), [(0.51, 0.0), (-0.51, 0.0), (0.0, 0.81), (0.0, -0.81), (math.nan, 0.0)])
-def test_no_velocity_beyond_a_limit_is_sent_in_either_direction(bench: Bench, speed: float, yaw_rate: float) -> None:
+def test_no_velocity_beyond_a_limit_is_sent_in_either_direction(bench: Bench, speed: float, yaw_rate: float):
     with pytest.raises(LimitError, match="nothing was sent"):
         bench.vehicle.drive(speed, yaw_rate)
     bench.bus.frames.clear()
@@ -124,7 +124,7 @@ def test_no_velocity_beyond_a_limit_is_sent_in_either_direction(bench: Bench, sp
 
 
 @pytest.mark.parametrize("end", ["stop", "brake", "enable", "close"])
-def test_the_last_velocity_is_not_kept_alive_by_whatever_ends_it(bench: Bench, end: str) -> None:
+def test_the_last_velocity_is_not_kept_alive_by_whatever_ends_it(bench: Bench, end: str):
     """At once: neither the vehicle's own time limit nor the driver's for a velocity that is not renewed is awaited."""
     bench.drive_until_fast()
     bench.bus.frames.clear()
@@ -140,9 +140,7 @@ def test_the_last_velocity_is_not_kept_alive_by_whatever_ends_it(bench: Bench, e
         bench.until(bench.braked)
 
 
-def test_a_stop_that_nobody_confirms_is_told_bars_driving_meanwhile_and_the_brake_locks_all_the_same(
-    bench: Bench,
-) -> None:
+def test_a_stop_that_nobody_confirms_is_told_bars_driving_meanwhile_and_the_brake_locks_all_the_same(bench: Bench):
     bench.until(lambda: bench.vehicle._feedback.stands(0.0))
     bench.bus.talking = False  # its newest word, that it stands, is from before the stop
     problems: list[Exception] = []
@@ -164,7 +162,7 @@ def test_a_stop_that_nobody_confirms_is_told_bars_driving_meanwhile_and_the_brak
     bench.until(bench.braked)
 
 
-def test_silence_is_told_to_one_who_drives_within_half_a_second_and_an_old_reading_is_none(bench: Bench) -> None:
+def test_silence_is_told_to_one_who_drives_within_half_a_second_and_an_old_reading_is_none(bench: Bench):
     bench.drive_until_fast()
     bench.bus.talking = False
     begun = time.monotonic()
@@ -179,7 +177,7 @@ def test_silence_is_told_to_one_who_drives_within_half_a_second_and_an_old_readi
 
 
 @pytest.mark.parametrize("take", ["brake", "recover"])
-def test_a_brake_that_somebody_else_released_is_not_taken_as_locked(bench: Bench, take: str) -> None:
+def test_a_brake_that_somebody_else_released_is_not_taken_as_locked(bench: Bench, take: str):
     """Whether this program had taken command or has only braked."""
     getattr(bench.vehicle, take)()
     bench.until(lambda: bench.vehicle.state(1.0).braked is True)
@@ -192,7 +190,7 @@ def test_a_brake_that_somebody_else_released_is_not_taken_as_locked(bench: Bench
         assert bench.vehicle.state(1.0).braked is True
 
 
-def test_a_parked_vehicle_whose_feedback_is_late_holds_nothing_up_and_one_that_is_silent_does(bench: Bench) -> None:
+def test_a_parked_vehicle_whose_feedback_is_late_holds_nothing_up_and_one_that_is_silent_does(bench: Bench):
     """A program that computes reads late; the arm retreats all the same, as long as the brake is known to be locked."""
     nothing = Situation(
         None, bench.vehicle, None, None, {}, lambda joints, command: (), lambda joints: None, {}, "", clock=bench.clock
@@ -211,7 +209,7 @@ def test_a_parked_vehicle_whose_feedback_is_late_holds_nothing_up_and_one_that_i
         interlocks.require(move)
 
 
-def test_a_vehicle_whose_brake_is_open_is_not_taken_as_parked_by_an_old_reading(bench: Bench) -> None:
+def test_a_vehicle_whose_brake_is_open_is_not_taken_as_parked_by_an_old_reading(bench: Bench):
     nothing = Situation(
         None, bench.vehicle, None, None, {}, lambda joints, command: (), lambda joints: None, {}, "", clock=bench.clock
     )
@@ -221,7 +219,7 @@ def test_a_vehicle_whose_brake_is_open_is_not_taken_as_parked_by_an_old_reading(
         Interlocks(nothing, RULES).require(DeviceCommand("arm", "move_joints"))
 
 
-def test_a_restart_is_noticed_although_another_node_keeps_talking(bench: Bench) -> None:
+def test_a_restart_is_noticed_although_another_node_keeps_talking(bench: Bench):
     """Its counters come back where they were, so that only its silence tells; the bus itself is never silent."""
     before = bench.vehicle.state().interruptions
     with can.Bus(channel=bench.channel, interface="virtual") as other:
@@ -248,9 +246,7 @@ def heard(vehicle: AgilexVehicle) -> bool:
 
 
 @pytest.mark.parametrize("end", ["stop", "brake"])
-def test_who_was_stopped_while_it_was_enabled_keeps_its_brake(
-    bench: Bench, end: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_was_stopped_while_it_was_enabled_keeps_its_brake(bench: Bench, end: str, monkeypatch):
     """By another thread, while the vehicle took its time to change its mode."""
     bench.vehicle.brake()
     bench.until(bench.braked)
@@ -280,14 +276,14 @@ def test_who_was_stopped_while_it_was_enabled_keeps_its_brake(
 )
 def test_its_version_is_told_however_it_answers_and_not_answering_is_no_fault(
     bench: Bench, answers: int | None, firmware: str
-) -> None:
+):
     with bench.sending(lambda frame: None if frame.id in {0x4A1, 0x41A} - {answers} else frame):
         assert bench.vehicle.identity().firmware == firmware
     assert bench.vehicle.statistics.errors == {}
     bench.vehicle.check()
 
 
-def test_frames_of_another_length_are_not_read_and_are_told(bench: Bench) -> None:
+def test_frames_of_another_length_are_not_read_and_are_told(bench: Bench):
     def short(frame: CanFrame) -> CanFrame:
         return replace(frame, data=frame.data[:-1]) if frame.id == 0x311 else frame
 
@@ -296,7 +292,7 @@ def test_frames_of_another_length_are_not_read_and_are_told(bench: Bench) -> Non
         bench.connect()
 
 
-def test_an_interrupt_while_it_connects_leaves_no_bus_open(bench: Bench) -> None:
+def test_an_interrupt_while_it_connects_leaves_no_bus_open(bench: Bench):
     bench.bus.talking = False
     threading.Timer(0.1, _thread.interrupt_main).start()
     with pytest.raises(KeyboardInterrupt):
@@ -304,7 +300,7 @@ def test_an_interrupt_while_it_connects_leaves_no_bus_open(bench: Bench) -> None
     assert [thread.name for thread in threading.enumerate()].count("vehicle receiver") == 1
 
 
-def test_a_person_at_the_remote_control_is_in_charge(bench: Bench) -> None:
+def test_a_person_at_the_remote_control_is_in_charge(bench: Bench):
     def remote(frame: CanFrame) -> CanFrame:
         return replace(frame, data=frame.data[:1] + b"\x03" + frame.data[2:]) if frame.id == 0x211 else frame
 
@@ -312,7 +308,7 @@ def test_a_person_at_the_remote_control_is_in_charge(bench: Bench) -> None:
         bench.vehicle.enable()
 
 
-def test_what_other_nodes_send_is_not_the_vehicles(bench: Bench) -> None:
+def test_what_other_nodes_send_is_not_the_vehicles(bench: Bench):
     """Long identifiers of its own numbers that say it is fast and in emergency stop, remote requests, errors."""
     wild = {0x211: bytes([1, 3, 0, 1, 255, 255, 0, 9]), 0x221: b"\x7f\xff" * 4, 0x311: b"\x7f\xff\xff\xff" * 2}
     wild |= {0x111: b"\x01\xf4" * 4, 0x131: bytes(8)}

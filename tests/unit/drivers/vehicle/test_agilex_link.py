@@ -17,7 +17,7 @@ def database() -> Database:
     return load_database()
 
 
-def test_every_identifier_of_the_protocol_is_there(database: Database) -> None:
+def test_every_identifier_of_the_protocol_is_there(database: Database):
     identifiers = {message.frame_id for message in database.messages}
     motors = {0x250 + i for i in range(1, 9)} | {0x260 + i for i in range(1, 9)}
     commands = {0x421, 0x111, 0x131, 0x141, 0x441, 0x411}
@@ -33,14 +33,12 @@ def test_every_identifier_of_the_protocol_is_there(database: Database) -> None:
         (1.5, -1.0, "05 dc fc 18 00 00 00 00"),
     ],
 )
-def test_velocity_commands_are_big_endian_milli_units(
-    database: Database, speed: float, yaw_rate: float, data: str
-) -> None:
+def test_velocity_commands_are_big_endian_milli_units(database: Database, speed: float, yaw_rate: float, data: str):
     signals = {"Speed": speed, "YawRate": yaw_rate, "LateralSpeed": 0.0, "Steering": 0.0}
     assert database.encode_message("MotionCommand", signals) == bytes.fromhex(data)
 
 
-def test_feedback_is_read_at_its_places(database: Database) -> None:
+def test_feedback_is_read_at_its_places(database: Database):
     def decoded(identifier: int, data: bytes) -> dict[str, float]:
         return dict(database.decode_message(identifier, data, decode_choices=False))  # type: ignore[arg-type]
 
@@ -67,7 +65,7 @@ def test_feedback_is_read_at_its_places(database: Database) -> None:
         }
 
 
-def test_odometry_follows_a_circle_back_to_its_start() -> None:
+def test_odometry_follows_a_circle_back_to_its_start():
     odometry = PlanarOdometry(TRACK)
     radius, steps = 1.0, 2000
     for step in range(steps + 1):
@@ -81,14 +79,14 @@ def test_odometry_follows_a_circle_back_to_its_start() -> None:
     assert odometry.yaw == pytest.approx(2.0 * math.pi, abs=0.004)
 
 
-def test_odometers_may_wrap() -> None:
+def test_odometers_may_wrap():
     odometry = PlanarOdometry(TRACK)
     odometry.update(2**31 - 10, 2**31 - 10, farthest=0.1)
     assert odometry.update(-(2**31) + 10, -(2**31) + 10, farthest=0.1)
     assert (odometry.x, odometry.y, odometry.yaw) == pytest.approx((0.020, 0.0, 0.0))
 
 
-def test_a_restarted_vehicle_does_not_throw_the_odometry_about() -> None:
+def test_a_restarted_vehicle_does_not_throw_the_odometry_about():
     odometry = PlanarOdometry(TRACK)
     odometry.update(50_000, 50_000, farthest=0.1)
     assert odometry.update(50_050, 50_050, farthest=0.1) and not odometry.update(0, 0, farthest=0.1)

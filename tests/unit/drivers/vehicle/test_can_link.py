@@ -14,7 +14,7 @@ from tests.support.wire.vehicle_bench import TRACK, Bench, benched, threads
 pytestmark = pytest.mark.wire
 
 
-def test_a_dead_bus_is_a_fault_and_enabling_opens_it_again(enabled: Bench) -> None:
+def test_a_dead_bus_is_a_fault_and_enabling_opens_it_again(enabled: Bench):
     enabled.drive_for(0.5, 0.3)
     enabled.peer.fault("can.bus_off")
     with pytest.raises(DeviceFault, match="CAN bus") as caught:
@@ -37,9 +37,7 @@ def test_a_dead_bus_is_a_fault_and_enabling_opens_it_again(enabled: Bench) -> No
     assert enabled.vehicle.statistics.errors["reopened"] == 1
 
 
-def test_a_bus_that_cannot_be_opened_yet_is_opened_by_the_next_recovery(
-    enabled: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bus_that_cannot_be_opened_yet_is_opened_by_the_next_recovery(enabled: Bench, monkeypatch):
     def unplugged(**settings: object) -> can.BusABC:
         raise can.CanInitializationError("no such adapter")
 
@@ -55,7 +53,7 @@ def test_a_bus_that_cannot_be_opened_yet_is_opened_by_the_next_recovery(
     assert enabled.vehicle.state().braked
 
 
-def test_an_adapter_that_refuses_every_frame_is_a_fault_within_half_a_second() -> None:
+def test_an_adapter_that_refuses_every_frame_is_a_fault_within_half_a_second():
     with benched(1.0) as made:
         made.vehicle.enable()
         made.drive_for(0.3, 0.2)
@@ -71,7 +69,7 @@ def test_an_adapter_that_refuses_every_frame_is_a_fault_within_half_a_second() -
 
 
 @pytest.mark.parametrize("refused", [LOCKS - 1, 1000])
-def test_a_lock_that_the_adapter_refuses_is_not_taken_as_locked_and_sent_again(refused: int) -> None:
+def test_a_lock_that_the_adapter_refuses_is_not_taken_as_locked_and_sent_again(refused: int):
     left = refused
     with benched(1.0) as made:
         take, state = made.peer._bus._command, made.vehicle.state
@@ -96,7 +94,7 @@ def test_a_lock_that_the_adapter_refuses_is_not_taken_as_locked_and_sent_again(r
         made.until(lambda: state().braked is True)
 
 
-def test_commands_come_every_20_ms_and_closing_ends_them() -> None:
+def test_commands_come_every_20_ms_and_closing_ends_them():
     with (
         benched(1.0) as made,
         can.Bus(interface="slcan", channel=made.peer.channel, sleep_after_open=0, timeout=0.005) as observer,
@@ -113,7 +111,7 @@ def test_commands_come_every_20_ms_and_closing_ends_them() -> None:
         assert threads() == []
 
 
-def test_nobody_on_the_bus_is_named() -> None:
+def test_nobody_on_the_bus_is_named():
     with pytest.raises(NotConnectedError, match="no vehicle reports on virtual:empty"):
         AgilexVehicle("vehicle", "virtual", "empty", track=TRACK, max_speed=1.0, max_yaw_rate=1.0, clock=Clock())
     with pytest.raises(NotConnectedError, match="cannot be opened"):

@@ -47,7 +47,7 @@ def bench() -> Bench:
         (0x0800, ("bit 0x0800",)),
     ],
 )
-def test_error_bits_are_told_in_the_makers_words(bits: int, words: tuple[str, ...]) -> None:
+def test_error_bits_are_told_in_the_makers_words(bits: int, words: tuple[str, ...]):
     assert system_trouble(bits, commanded=True) == words
     bench = Bench()
     bench.notify(0, 0, bits=bits)
@@ -59,7 +59,7 @@ def test_error_bits_are_told_in_the_makers_words(bits: int, words: tuple[str, ..
     assert caught.value.code == "vehicle.error"
 
 
-def test_an_error_that_came_while_driving_is_for_a_person_to_look_at(bench: Bench) -> None:
+def test_an_error_that_came_while_driving_is_for_a_person_to_look_at(bench: Bench):
     """It may be a collision; one that came while it stood is cleared by a program."""
     for driven in (True, False):
         if driven:
@@ -73,7 +73,7 @@ def test_an_error_that_came_while_driving_is_for_a_person_to_look_at(bench: Benc
         assert ("driven against" in caught.value.hint) is driven
 
 
-def test_a_motor_drivers_overload_is_a_fault_and_being_enabled_is_none() -> None:
+def test_a_motor_drivers_overload_is_a_fault_and_being_enabled_is_none():
     assert driver_trouble(3, 0x44) == ("motor 3: overloaded",)
     bench = Bench()
     bench.feedback.take("MotorDriver2", {"DriverStatus": 0x40})
@@ -84,7 +84,7 @@ def test_a_motor_drivers_overload_is_a_fault_and_being_enabled_is_none() -> None
 
 
 @pytest.mark.parametrize("mode", [0, 3])
-def test_whoever_took_command_away_is_for_a_person_to_find_out(bench: Bench, mode: int) -> None:
+def test_whoever_took_command_away_is_for_a_person_to_find_out(bench: Bench, mode: int):
     bench.notify(0, 0, mode=mode)
     bench.feedback.check(in_command=False, driving=False)
     with pytest.raises(DeviceFault, match="left CAN command") as caught:
@@ -93,7 +93,7 @@ def test_whoever_took_command_away_is_for_a_person_to_find_out(bench: Bench, mod
     assert bench.interruption()[0] == 1
 
 
-def test_silence_is_a_fault_at_once_for_one_who_drives_and_when_it_is_sure_for_one_who_stands(bench: Bench) -> None:
+def test_silence_is_a_fault_at_once_for_one_who_drives_and_when_it_is_sure_for_one_who_stands(bench: Bench):
     bench.clock.time += 0.6
     with pytest.raises(DeviceFault, match=r"no feedback for 0\.60 s") as caught:
         bench.feedback.check(in_command=True, driving=True)
@@ -107,7 +107,7 @@ def test_silence_is_a_fault_at_once_for_one_who_drives_and_when_it_is_sure_for_o
         bench.feedback.check(in_command=True, driving=False)
 
 
-def test_a_message_that_stopped_is_missed_though_the_others_go_on(bench: Bench) -> None:
+def test_a_message_that_stopped_is_missed_though_the_others_go_on(bench: Bench):
     for _ in range(25):
         bench.clock.time += 0.001
         bench.feedback.idle(0.1)
@@ -119,7 +119,7 @@ def test_a_message_that_stopped_is_missed_though_the_others_go_on(bench: Bench) 
 
 
 @pytest.mark.parametrize("late", ["Odometry", "MotionState", "SystemState"])
-def test_a_reading_is_as_old_as_the_oldest_of_what_it_is_made_of(bench: Bench, late: str) -> None:
+def test_a_reading_is_as_old_as_the_oldest_of_what_it_is_made_of(bench: Bench, late: str):
     kept = bench.feedback.get(late)
     bench.clock.time += 0.5
     bench.notify(0, 0)
@@ -131,7 +131,7 @@ def test_a_reading_is_as_old_as_the_oldest_of_what_it_is_made_of(bench: Bench, l
 
 
 @pytest.mark.parametrize(("speed", "yaw_rate"), [(0.1, 0.0), (-0.1, 0.0), (0.0, 0.1), (0.0, -0.1)])
-def test_a_vehicle_that_rolls_back_or_turns_does_not_stand(bench: Bench, speed: float, yaw_rate: float) -> None:
+def test_a_vehicle_that_rolls_back_or_turns_does_not_stand(bench: Bench, speed: float, yaw_rate: float):
     asked = bench.clock.time
     assert not bench.feedback.stands(asked)  # what was told before says nothing
     for _ in range(STILL_FRAMES):
@@ -143,9 +143,7 @@ def test_a_vehicle_that_rolls_back_or_turns_does_not_stand(bench: Bench, speed: 
 
 
 @pytest.mark.parametrize(("speeds", "way"), [((0.0, 0.2), 0), ((0.0, 0.0, 0.0, 0.2), 0), ((0.0,), 3), ((0.0,), -3)])
-def test_a_stop_is_confirmed_by_feedback_that_agrees_with_itself(
-    bench: Bench, speeds: tuple[float, ...], way: int
-) -> None:
+def test_a_stop_is_confirmed_by_feedback_that_agrees_with_itself(bench: Bench, speeds: tuple[float, ...], way: int):
     """Not by frames of standstill between others, and not while the wheels count on."""
     bench.feedback.commanded_to_move()
     bench.notify(0, 0, speed=0.2)
@@ -159,7 +157,7 @@ def test_a_stop_is_confirmed_by_feedback_that_agrees_with_itself(
 
 @pytest.mark.parametrize("every", [1, 2, 5])
 @pytest.mark.parametrize(("other", "step"), [(12_000, 0), (0, 6), (-40, 6), (12_000, 6)])
-def test_two_series_of_counts_are_two_vehicles(bench: Bench, other: int, step: int, every: int) -> None:
+def test_two_series_of_counts_are_two_vehicles(bench: Bench, other: int, step: int, every: int):
     """Whether one stands beside the other or far off, and however seldom the second tells: within 0.5 s."""
     bench.feedback.commanded_to_move()
     with pytest.raises(DeviceFault, match="two vehicles report under the same identifiers") as met:
@@ -179,19 +177,19 @@ def test_two_series_of_counts_are_two_vehicles(bench: Bench, other: int, step: i
     bench.feedback.check(in_command=True, driving=True)
 
 
-def test_a_speed_that_wavers_by_three_millimetres_a_second_is_standstill(bench: Bench) -> None:
+def test_a_speed_that_wavers_by_three_millimetres_a_second_is_standstill(bench: Bench):
     bench.feedback.commanded_to_move()
     for waver in (0.003, -0.003, 0.001, -0.002, 0.003, 0.0, -0.003, 0.002):
         bench.notify(0, 0, speed=waver)
     assert bench.feedback.stands(0.0)
 
 
-def test_a_low_battery_and_a_missing_remote_control_are_warnings(bench: Bench) -> None:
+def test_a_low_battery_and_a_missing_remote_control_are_warnings(bench: Bench):
     bench.notify(0, 0, bits=0x0002 | 0x0004)
     assert bench.feedback.state(1.0, None).warnings == ("the battery is low", "no signal of the remote control")
 
 
-def test_command_is_taken_only_once_the_vehicle_says_so_afterwards_and_without_a_fault(bench: Bench) -> None:
+def test_command_is_taken_only_once_the_vehicle_says_so_afterwards_and_without_a_fault(bench: Bench):
     asked = bench.clock.time
     assert not bench.feedback.commanded(asked)
     for wrong in ({"mode": 0}, {"mode": 3}, {"state": 1}, {"state": 2}, {"bits": 0x0100}):
@@ -201,7 +199,7 @@ def test_command_is_taken_only_once_the_vehicle_says_so_afterwards_and_without_a
     assert bench.feedback.commanded(asked)
 
 
-def test_an_emergency_stop_is_told_whoever_is_in_command_and_no_program_clears_it() -> None:
+def test_an_emergency_stop_is_told_whoever_is_in_command_and_no_program_clears_it():
     for in_command in (True, False):
         bench = Bench()
         bench.notify(0, 0, state=1)
@@ -221,7 +219,7 @@ def test_an_emergency_stop_is_told_whoever_is_in_command_and_no_program_clears_i
 )
 def test_whoever_else_commands_it_is_noticed_and_takes_its_place_along(
     bench: Bench, message: str, signals: dict[str, float]
-) -> None:
+):
     bench.feedback.take("MotionCommand", {"Speed": 0.0, "YawRate": 0.0})
     bench.feedback.take("BrakeCommand", {"Locked": 1})
     bench.feedback.check(in_command=True, driving=False)
@@ -233,13 +231,13 @@ def test_whoever_else_commands_it_is_noticed_and_takes_its_place_along(
 
 
 @pytest.mark.parametrize("pushed", [(-6, 0), (0, 6), (0, -6)])
-def test_each_wheel_tells_of_a_push_either_way(bench: Bench, pushed: tuple[int, int]) -> None:
+def test_each_wheel_tells_of_a_push_either_way(bench: Bench, pushed: tuple[int, int]):
     bench.notify(0, 0)
     bench.notify(*pushed)
     assert bench.interruption() == (1, "it moved by 6 mm without a command")
 
 
-def test_odometry_that_jumps_or_stays_away_no_longer_tells_the_place(bench: Bench) -> None:
+def test_odometry_that_jumps_or_stays_away_no_longer_tells_the_place(bench: Bench):
     for count in range(50):
         bench.feedback.commanded_to_move()
         bench.notify(10 * count, 10 * count)
@@ -255,7 +253,7 @@ def test_odometry_that_jumps_or_stays_away_no_longer_tells_the_place(bench: Benc
     assert bench.interruption() == (2, "nothing was heard of it for 2.2 s")
 
 
-def test_a_vehicle_that_is_pushed_while_nobody_commands_it_is_noticed(bench: Bench) -> None:
+def test_a_vehicle_that_is_pushed_while_nobody_commands_it_is_noticed(bench: Bench):
     for _ in range(10):
         bench.notify(0, 0)
     bench.notify(4, 3)
@@ -269,7 +267,7 @@ def test_a_vehicle_that_is_pushed_while_nobody_commands_it_is_noticed(bench: Ben
 
 
 @pytest.mark.parametrize("after", [0.02, 1.0, 1.9, 60.0])
-def test_a_restart_is_noticed_however_long_its_feedback_stayed_away(bench: Bench, after: float) -> None:
+def test_a_restart_is_noticed_however_long_its_feedback_stayed_away(bench: Bench, after: float):
     """It counts from zero again; while it was away it cannot have driven, since nobody commanded it."""
     for count in range(50):
         bench.feedback.commanded_to_move()
@@ -283,7 +281,7 @@ def test_a_restart_is_noticed_however_long_its_feedback_stayed_away(bench: Bench
     assert bench.feedback.state(1.0, None).x == pytest.approx(0.49)
 
 
-def test_in_a_gap_it_can_have_driven_until_it_rests_after_its_last_command() -> None:
+def test_in_a_gap_it_can_have_driven_until_it_rests_after_its_last_command():
     """At 0.5 m/s and 0.5 rad/s a side counts 0.645 m in a second; it rests 4 s after its last command."""
     for gap, counted, lost in ((1.0, 600, False), (1.0, 720, True), (100.0, 2500, False), (100.0, 2700, True)):
         bench = Bench()
@@ -294,7 +292,7 @@ def test_in_a_gap_it_can_have_driven_until_it_rests_after_its_last_command() -> 
         assert bench.interruption()[0] >= 1 or not lost
 
 
-def test_what_moves_by_our_own_command_is_no_push(bench: Bench) -> None:
+def test_what_moves_by_our_own_command_is_no_push(bench: Bench):
     bench.feedback.commanded_to_move()
     for count in range(150):
         bench.notify(8 * count, 8 * count)
@@ -304,7 +302,7 @@ def test_what_moves_by_our_own_command_is_no_push(bench: Bench) -> None:
     assert bench.interruption() == (0, "")
 
 
-def test_a_version_text_shorter_than_its_frames_is_that_text_and_no_row_of_zeros() -> None:
+def test_a_version_text_shorter_than_its_frames_is_that_text_and_no_row_of_zeros():
     answer = VersionAnswer()
     for part in [b"SCOUT V2", b".3-1\0\0\0\0", *[bytes(8)] * 8]:
         assert not answer.is_complete()
@@ -316,7 +314,7 @@ def test_a_version_text_shorter_than_its_frames_is_that_text_and_no_row_of_zeros
 
 
 @pytest.mark.parametrize("message", ["VersionNumbers", "VersionResponse"])
-def test_a_version_may_be_told_in_numbers_under_either_identifier(message: str) -> None:
+def test_a_version_may_be_told_in_numbers_under_either_identifier(message: str):
     answer = VersionAnswer()
     numbers = {"ControllerHardware": 2, "DriverHardware": 1, "ControllerSoftware": 0x2041, "DriverSoftware": 110}
     answer.take(message, numbers)

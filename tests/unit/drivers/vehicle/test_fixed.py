@@ -38,7 +38,7 @@ class TestFixedVehicle(DeviceContract):
         yield Bench(lambda: FixedVehicle("vehicle", clock), clock)
 
 
-def test_it_stands_braked_and_is_not_driven() -> None:
+def test_it_stands_braked_and_is_not_driven():
     vehicle: Vehicle = FixedVehicle("vehicle", Clock())
     vehicle.enable()
     state = vehicle.state()
@@ -70,7 +70,7 @@ def job_at(folder: Path, *, target_x: float = -1050.0, start_z: float = -600.0) 
     return described(folder / f"{target_x:g} {start_z:g}", job={"approach": approach})[1]
 
 
-def test_a_place_out_of_reach_is_refused_with_how_much_is_missing(tmp_path: Path) -> None:
+def test_a_place_out_of_reach_is_refused_with_how_much_is_missing(tmp_path):
     """And start and staging, which nothing drives over, are not looked at."""
     config = load_config(fixed_cell(tmp_path))
     job, _ = load_job(job_at(tmp_path, start_z=-100.0))
@@ -81,7 +81,7 @@ def test_a_place_out_of_reach_is_refused_with_how_much_is_missing(tmp_path: Path
         require_fit(far, config, mesh)
 
 
-def test_in_a_simulated_cell_it_stands_still_where_the_job_has_it(tmp_path: Path) -> None:
+def test_in_a_simulated_cell_it_stands_still_where_the_job_has_it(tmp_path):
     config = load_config(fixed_cell(tmp_path))
     cell = VirtualCell(config, 3, "workshop", Described.of("pot"))
     assert cell.devices.vehicle.bare.identity().address == "fixed"
@@ -98,7 +98,7 @@ def test_in_a_simulated_cell_it_stands_still_where_the_job_has_it(tmp_path: Path
 
 
 @pytest.mark.campaign
-def test_a_whole_job_ends_placed_without_a_vehicle(calibrated_folder: Path) -> None:
+def test_a_whole_job_ends_placed_without_a_vehicle(calibrated_folder: Path):
     with Cell.open(fixed_cell(calibrated_folder), sim="all", clock="virtual", seed=2, job="pot") as opened:
         report = opened.run("pot").report
     assert (report["outcome"], report["end_state"]["collisions"]) == ("placed", [])
@@ -106,7 +106,7 @@ def test_a_whole_job_ends_placed_without_a_vehicle(calibrated_folder: Path) -> N
     assert report["steps"][0]["result"]["driven"] is False
 
 
-def test_a_configuration_names_it_with_nothing_else(tmp_path: Path) -> None:
+def test_a_configuration_names_it_with_nothing_else(tmp_path):
     config = load_config(fixed_cell(tmp_path))
     assert not config.vehicle.DRIVES
     assert config.calibration_hash() == load_config(None).calibration_hash()
@@ -114,7 +114,7 @@ def test_a_configuration_names_it_with_nothing_else(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("off", "refused"), [(0.0, False), (0.6, False), (1.5, True), (-1.5, True)])
-def test_the_station_has_to_stand_where_the_job_has_it(off: float, refused: bool) -> None:
+def test_the_station_has_to_stand_where_the_job_has_it(off: float, refused: bool):
     """Moved along and across by `off` times the tolerance."""
     stand = load_config(None).arm.vehicle_from_base.se3()
     place_from_vehicle = JOB.approach.target.se3()

@@ -9,7 +9,7 @@ from drivers.vehicle.agilex_link import load_database
 from drivers.vehicle.health import CanInterface, most_bits, parse_interface, readings
 
 
-def test_the_longest_can_frames_are_as_long_as_known() -> None:
+def test_the_longest_can_frames_are_as_long_as_known():
     """Worst cases of the literature on response times (Davis et al. 2007): 55 + 10 n and 80 + 10 n bits."""
     for n in range(9):
         assert most_bits(can.Message(data=bytes(n), is_extended_id=False)) == 55 + 10 * n
@@ -23,7 +23,7 @@ LINK = (
 )
 
 
-def test_what_linux_tells_of_a_can_interface_is_read_and_what_is_odd_is_not_made_up() -> None:
+def test_what_linux_tells_of_a_can_interface_is_read_and_what_is_odd_is_not_made_up():
     assert parse_interface("can0", LINK) == CanInterface("can0", True, 500_000, "ERROR-WARNING", 0, 97)
     assert parse_interface("can1", LINK) is None
     virtual = '[{"ifname":"vcan0","flags":["NOARP"],"linkinfo":{"info_kind":"vcan"}}]'
@@ -32,7 +32,7 @@ def test_what_linux_tells_of_a_can_interface_is_read_and_what_is_odd_is_not_made
         assert parse_interface("can0", odd) is None
 
 
-def test_readings_are_of_the_vehicles_newest_frames_and_of_no_other_nodes() -> None:
+def test_readings_are_of_the_vehicles_newest_frames_and_of_no_other_nodes():
     def frame(identifier: int, data: bytes, extended: bool = False) -> can.Message:
         return can.Message(arbitration_id=identifier, data=data, is_extended_id=extended)
 

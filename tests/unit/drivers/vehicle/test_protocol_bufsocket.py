@@ -10,7 +10,7 @@ from drivers.vehicle.can_link import SCHEME
 pytestmark = pytest.mark.wire
 
 
-def test_a_writer_that_was_not_run_for_long_is_not_a_stuck_adapter() -> None:
+def test_a_writer_that_was_not_run_for_long_is_not_a_stuck_adapter():
     """What the other end took at once was not late; one that takes nothing is."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = serial.serial_for_url(f"{SCHEME}127.0.0.1:{server.getsockname()[1]}", write_timeout=1e-9)

@@ -15,7 +15,7 @@ RESULT = {
 }
 
 
-def test_people_see_values_and_records_without_what_is_too_long(capsys: pytest.CaptureFixture[str]) -> None:
+def test_people_see_values_and_records_without_what_is_too_long(capsys):
     show(RESULT, json=False, without=("trials",))
     lines = capsys.readouterr().out.splitlines()
     shown = [[cell.strip() for cell in line.strip("│").split("│")] for line in lines if line.startswith("│")]
@@ -28,12 +28,12 @@ def test_people_see_values_and_records_without_what_is_too_long(capsys: pytest.C
     ]
 
 
-def test_scripts_get_all_of_it(capsys: pytest.CaptureFixture[str]) -> None:
+def test_scripts_get_all_of_it(capsys):
     show(RESULT, json=True, without=("trials",))
     assert json.loads(capsys.readouterr().out) == RESULT
 
 
-def test_a_bench_that_failed_ends_with_1_after_it_was_shown(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bench_that_failed_ends_with_1_after_it_was_shown(capsys):
     with pytest.raises(typer.Exit) as ended:
         show({"worlds": 3}, json=True, failed=["a violation"])
     assert (ended.value.exit_code, json.loads(capsys.readouterr().out)) == (1, {"worlds": 3})

@@ -17,7 +17,7 @@ def run():
     return one_seed(3)
 
 
-def test_a_calibrated_head_measures_as_well_as_its_covariance_says(run) -> None:
+def test_a_calibrated_head_measures_as_well_as_its_covariance_says(run):
     assert 0.9 < run["chi2_per_dof"] < 1.1
     points = run["points"]["1000"]
     # One head's mean error is one draw: it lies within a few times its expectation.
@@ -28,19 +28,19 @@ def test_a_calibrated_head_measures_as_well_as_its_covariance_says(run) -> None:
     assert run["table"]["joint"]["d"]["max"] < 0.3
 
 
-def test_table_rows_are_possible(run) -> None:
+def test_table_rows_are_possible(run):
     # The printed Table 1 is not: its largest D is more than its largest X, Y and Z together.
     for table in run["table"].values():
         together = np.sqrt(sum(table[axis]["max"] ** 2 for axis in "xyz"))
         assert table["d"]["max"] <= together + 1e-12
 
 
-def test_outliers_of_every_kind_are_found(run) -> None:
+def test_outliers_of_every_kind_are_found(run):
     assert run["outliers"]["recall"] >= 0.99 and run["outliers"]["precision"] >= 0.90
     assert run["outliers"]["recall_near"] >= 0.99
 
 
-def test_outliers_are_put_in_at_the_share_asked_for() -> None:
+def test_outliers_are_put_in_at_the_share_asked_for():
     centres = np.full((60, 480), 300.0)
     sweep = Sweep(centres, np.zeros(60), np.zeros((60, 480, 3)))
     spoiled = spoil(sweep, SPEC, 0.03, np.random.default_rng(0))
@@ -51,7 +51,7 @@ def test_outliers_are_put_in_at_the_share_asked_for() -> None:
     assert np.abs(spoiled.centres[spoiled.any] - 300.0).min() > 1.0
 
 
-def test_centres_of_dots_are_those_of_their_conics() -> None:
+def test_centres_of_dots_are_those_of_their_conics():
     head = draw_head(RigSpec(), np.random.default_rng(0), "ideal")
     board = Board.parse("marked_dots:11x9:3mm")
     rotation = pin.exp3(np.array([0.5, -0.3, 0.2]))
@@ -66,7 +66,7 @@ def test_centres_of_dots_are_those_of_their_conics() -> None:
     assert np.abs(dot_centres(head.optics, pose, board) - expected).max() < 2e-4
 
 
-def test_expected_length_of_a_round_error_is_that_of_maxwell() -> None:
+def test_expected_length_of_a_round_error_is_that_of_maxwell():
     sigma = 2e-5
     found = rig.expected_length(np.tile(sigma**2 * np.eye(3), (5, 1, 1)))
     assert found == pytest.approx(sigma * np.sqrt(8 / np.pi), rel=1e-9)
@@ -76,7 +76,7 @@ def test_expected_length_of_a_round_error_is_that_of_maxwell() -> None:
     assert rig.expected_length(plane) == pytest.approx(sigma * np.sqrt(np.pi / 2), rel=2e-3)
 
 
-def test_alignment_takes_out_a_rigid_motion_and_nothing_else() -> None:
+def test_alignment_takes_out_a_rigid_motion_and_nothing_else():
     rng = np.random.default_rng(1)
     points = rng.normal(size=(200, 3))
     moved = points @ pin.exp3(np.array([0.1, 0.2, -0.3])).T + [1.0, 2.0, 3.0]
@@ -86,7 +86,7 @@ def test_alignment_takes_out_a_rigid_motion_and_nothing_else() -> None:
     )
 
 
-def test_results_come_in_the_order_of_the_tasks_and_each_is_told() -> None:
+def test_results_come_in_the_order_of_the_tasks_and_each_is_told():
     told: list[int] = []
     assert over_cores([(abs, -4), (pow, 3, 2)], 1, told.append) == [4, 9]
     assert sorted(told) == [4, 9]

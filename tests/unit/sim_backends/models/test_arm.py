@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
         ("UR10e", (120, 120, 180, 180, 180, 180)), ("UR30", (120, 120, 150, 210, 210, 210)),
     ],
 )  # fmt: skip
-def test_each_models_joints_turn_as_fast_as_the_maker_says_and_no_faster(name: str, fastest: tuple[float, ...]) -> None:
+def test_each_models_joints_turn_as_fast_as_the_maker_says_and_no_faster(name: str, fastest: tuple[float, ...]):
     for joint, limit in enumerate(fastest):
         model = ArmModel(ArmParams.of(name), np.random.default_rng(3), WorldClock())
         # The others go as well, but not as far: the leading joint limits all.
@@ -37,7 +37,7 @@ def test_each_models_joints_turn_as_fast_as_the_maker_says_and_no_faster(name: s
         assert model.safety is Safety.NORMAL and model.idle
 
 
-def test_the_reported_pose_follows_the_nominal_table_and_the_true_pose_the_true_one() -> None:
+def test_the_reported_pose_follows_the_nominal_table_and_the_true_pose_the_true_one():
     error = np.random.default_rng(5).normal(scale=3e-4, size=(6, 4))
     arm = make_arm(dh_error=error)
     arm.start(JointMove(arm.drive.q + 0.2, 1.0, 2.0))
@@ -47,7 +47,7 @@ def test_the_reported_pose_follows_the_nominal_table_and_the_true_pose_the_true_
     np.testing.assert_allclose(arm.base_from_flange(arm.time), true, atol=1e-12)
 
 
-def test_each_rest_has_its_own_error_of_the_stated_size_and_keeps_it() -> None:
+def test_each_rest_has_its_own_error_of_the_stated_size_and_keeps_it():
     arm = make_arm(repeatability=(30e-6, 20e-6))
     home, away = arm.drive.q.copy(), arm.drive.q + 0.1
     rests = []
@@ -68,7 +68,7 @@ def test_each_rest_has_its_own_error_of_the_stated_size_and_keeps_it() -> None:
     assert abs(np.corrcoef(np.array(rests)[:-1, 0], np.array(rests)[1:, 0])[0, 1]) < 0.3
 
 
-def test_the_true_pose_never_jumps() -> None:
+def test_the_true_pose_never_jumps():
     arm = make_arm(repeatability=(50e-6, 0.0))
     arm.start(JointMove(arm.drive.q + np.array([0.1, 0, 0, 0, 0, 0]), 0.5, 1.0))
     last, jumps = arm.base_from_flange(arm.time), []
@@ -82,7 +82,7 @@ def test_the_true_pose_never_jumps() -> None:
     assert max(jumps) < 5 * 50e-6 * math.pi / 2 / 150 + 2e-6
 
 
-def test_a_force_above_the_limit_stops_the_arm() -> None:
+def test_a_force_above_the_limit_stops_the_arm():
     arm = make_arm()
     surface = arm.reported_flange()[2, 3] - 0.02
     arm.contact = lambda pose: np.array([0.0, 0, 5e4 * max(0.0, surface - pose[2, 3]), 0, 0, 0])
@@ -94,7 +94,7 @@ def test_a_force_above_the_limit_stops_the_arm() -> None:
     assert surface - arm.reported_flange()[2, 3] == pytest.approx(150 / 5e4, abs=2e-4)
 
 
-def test_the_wrench_can_be_taken_as_zero_and_carries_the_stated_noise() -> None:
+def test_the_wrench_can_be_taken_as_zero_and_carries_the_stated_noise():
     arm = make_arm(force_noise=(0.5, 0.05))
     arm.contact = lambda pose: np.array([1.0, 2.0, -30.0, 0.1, 0.2, 0.3])
     run(arm, 0.01)
@@ -108,7 +108,7 @@ def test_the_wrench_can_be_taken_as_zero_and_carries_the_stated_noise() -> None:
 
 
 @pytest.mark.parametrize("way", [np.array([2.0, 0, 0, 0, 0, 0]), np.array([0, 0, 0, 0, 0, math.nan])])
-def test_a_servo_target_that_cannot_be_followed_is_a_protective_stop(way: Array) -> None:
+def test_a_servo_target_that_cannot_be_followed_is_a_protective_stop(way: Array):
     arm = make_arm()
     arm.start(Servo(arm.drive.q + way, 0.02))
     run(arm, 0.5)
@@ -118,7 +118,7 @@ def test_a_servo_target_that_cannot_be_followed_is_a_protective_stop(way: Array)
     assert not arm.moving
 
 
-def test_a_joint_beyond_its_range_is_a_protective_stop() -> None:
+def test_a_joint_beyond_its_range_is_a_protective_stop():
     arm = make_arm(initial_q=np.array([6.0, -1.5, -1.5, -1.5, 1.5, 0]))
     arm.start(JointSpeed(np.array([1.0, 0, 0, 0, 0, 0]), 5.0))
     run(arm, 1.0)
@@ -127,7 +127,7 @@ def test_a_joint_beyond_its_range_is_a_protective_stop() -> None:
     assert arm.drive.q[0] <= 2 * math.pi
 
 
-def test_a_protective_stop_can_be_unlocked_after_its_delay_and_the_motion_resumed() -> None:
+def test_a_protective_stop_can_be_unlocked_after_its_delay_and_the_motion_resumed():
     arm = make_arm()
     target = arm.drive.q + 0.5
     arm.start(JointMove(target, 0.5, 1.0))

@@ -10,7 +10,7 @@ from sim_backends.models.arm_kinematics import UR10E_DH, JointErrors, Kinematics
 from tests.support.simulator.simulated_arm import pinocchio_arm, pinocchio_flange
 
 
-def test_rotation_vectors_agree_with_pinocchio_up_to_half_a_turn() -> None:
+def test_rotation_vectors_agree_with_pinocchio_up_to_half_a_turn():
     rng = np.random.default_rng(4)
     axes = rng.normal(size=(40, 3))
     axes /= np.linalg.norm(axes, axis=1)[:, None]
@@ -20,7 +20,7 @@ def test_rotation_vectors_agree_with_pinocchio_up_to_half_a_turn() -> None:
     np.testing.assert_allclose(np.abs(rotation_vector(down)), math.pi / math.sqrt(2) * np.array([1, 1, 0]), atol=1e-12)
 
 
-def test_a_stretched_arm_sags_about_its_shoulder() -> None:
+def test_a_stretched_arm_sags_about_its_shoulder():
     errors = JointErrors(Kinematics(UR10E_DH), np.zeros((6, 4)), compliance=3e-6, mass=2.0)
     flat = np.zeros(6)
     reach = np.linalg.norm(Kinematics(UR10E_DH).forward(flat)[:2, 3])
@@ -30,7 +30,7 @@ def test_a_stretched_arm_sags_about_its_shoulder() -> None:
     assert lowered < 0.0
 
 
-def test_with_a_memory_the_error_changes_with_the_way_and_keeps_its_size() -> None:
+def test_with_a_memory_the_error_changes_with_the_way_and_keeps_its_size():
     def run(step: float, rng: np.random.Generator) -> tuple[float, float]:
         made = TruePose(Kinematics(UR10E_DH), (1e-4, 0.0), 0.3, rng, memory=0.5)
         q = np.zeros(6)
@@ -49,7 +49,7 @@ def test_with_a_memory_the_error_changes_with_the_way_and_keeps_its_size() -> No
     assert far[1] == pytest.approx(3e-8, rel=0.2)
 
 
-def test_forward_kinematics_and_jacobian_agree_with_pinocchio() -> None:
+def test_forward_kinematics_and_jacobian_agree_with_pinocchio():
     rng = np.random.default_rng(1)
     for _ in range(20):
         table = UR10E_DH + rng.normal(scale=1e-3, size=(6, 4))
@@ -65,7 +65,7 @@ def test_forward_kinematics_and_jacobian_agree_with_pinocchio() -> None:
         np.testing.assert_allclose(jacobian, expected, atol=1e-12)
 
 
-def test_inverse_kinematics_reaches_the_pose_within_the_joint_limits() -> None:
+def test_inverse_kinematics_reaches_the_pose_within_the_joint_limits():
     rng = np.random.default_rng(2)
     for _ in range(50):
         target = pinocchio_flange(UR10E_DH, rng.uniform(-3, 3, 6))

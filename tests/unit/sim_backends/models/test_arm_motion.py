@@ -10,7 +10,7 @@ from sim_backends.models.arm_motion import ForceMode, JointMove, LinearMove, Ser
 from tests.support.simulator.simulated_arm import TICK, finish, make_arm, pinocchio_flange, run
 
 
-def test_a_joint_move_takes_the_time_of_its_trapezoid_and_arrives_exactly() -> None:
+def test_a_joint_move_takes_the_time_of_its_trapezoid_and_arrives_exactly():
     arm = make_arm()
     target = arm.drive.q + np.array([0.8, -0.2, 0.1, 0.0, 0.3, -0.4])
     arm.start(JointMove(target, 0.5, 1.0))
@@ -19,7 +19,7 @@ def test_a_joint_move_takes_the_time_of_its_trapezoid_and_arrives_exactly() -> N
     np.testing.assert_array_equal(arm.drive.qd, np.zeros(6))
 
 
-def test_a_linear_move_keeps_to_the_line_at_its_speed() -> None:
+def test_a_linear_move_keeps_to_the_line_at_its_speed():
     arm = make_arm()
     start = arm.reported_flange()
     target = start.copy()
@@ -38,7 +38,7 @@ def test_a_linear_move_keeps_to_the_line_at_its_speed() -> None:
     np.testing.assert_allclose(arm.reported_flange(), target, atol=1e-8)
 
 
-def test_a_servo_target_that_moves_evenly_is_followed_with_the_lag() -> None:
+def test_a_servo_target_that_moves_evenly_is_followed_with_the_lag():
     arm = make_arm()
     start = arm.drive.q.copy()
     servo = Servo(start, lag=0.05)
@@ -53,7 +53,7 @@ def test_a_servo_target_that_moves_evenly_is_followed_with_the_lag() -> None:
     np.testing.assert_allclose(arm.drive.q, servo.target, atol=1e-8)
 
 
-def test_force_mode_settles_at_the_wanted_force() -> None:
+def test_force_mode_settles_at_the_wanted_force():
     arm = make_arm()
     surface = arm.reported_flange()[2, 3] - 0.005
     arm.contact = lambda pose: np.array([0.0, 0, 1e5 * max(0.0, surface - pose[2, 3]), 0, 0, 0])
@@ -64,7 +64,7 @@ def test_force_mode_settles_at_the_wanted_force() -> None:
     assert np.abs(arm.reported_flange()[:2, 3] - pinocchio_flange(UR10E_DH, arm.params.initial_q)[:2, 3]).max() < 1e-5
 
 
-def test_a_line_through_the_edge_of_the_reach_is_a_protective_stop() -> None:
+def test_a_line_through_the_edge_of_the_reach_is_a_protective_stop():
     arm = make_arm()
     target = arm.reported_flange()
     target[0, 3] += 1.0

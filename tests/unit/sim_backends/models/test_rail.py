@@ -14,7 +14,7 @@ def rail(seed: int = 1, **params: object) -> RailModel:
     return RailModel(RailParams(**params), np.random.default_rng(seed))  # type: ignore[arg-type]
 
 
-def test_a_stop_on_the_way_ends_the_motion_on_the_ramp_and_the_past_stays_as_it_was() -> None:
+def test_a_stop_on_the_way_ends_the_motion_on_the_ramp_and_the_past_stays_as_it_was():
     model = rail()
     model.configure(0.0, RailSettings(max_velocity=5 * STEPS, max_acceleration=20 * STEPS))
     model.rotate(0.0, 5 * STEPS)
@@ -24,7 +24,7 @@ def test_a_stop_on_the_way_ends_the_motion_on_the_ramp_and_the_past_stays_as_it_
     assert model.carriage(9.0) - model.carriage(2.0) == pytest.approx(LEAD * 5.0**2 / (2 * 20.0), abs=1e-12)
 
 
-def test_the_carriage_shows_lead_error_periodic_error_and_backlash() -> None:
+def test_the_carriage_shows_lead_error_periodic_error_and_backlash():
     screw = Screw(scale_error=1e-3, periodic=4e-6, phase=0.7, backlash=12e-6)
     model = rail(screw=screw, start=0.0)
 
@@ -45,7 +45,7 @@ def test_the_carriage_shows_lead_error_periodic_error_and_backlash() -> None:
     assert np.min(residual) == pytest.approx(-4e-6, rel=0.01)
 
 
-def test_searches_scatter_by_the_repeatability() -> None:
+def test_searches_scatter_by_the_repeatability():
     model = rail(repeatability=5e-6)
     model.configure(0.0, RailSettings(search_mode=5))
     edges = []
@@ -57,7 +57,7 @@ def test_searches_scatter_by_the_repeatability() -> None:
 
 
 @pytest.mark.parametrize("soft", [False, True])
-def test_a_limit_switch_stops_the_motor_at_once_or_on_the_ramp(soft: bool) -> None:
+def test_a_limit_switch_stops_the_motor_at_once_or_on_the_ramp(soft: bool):
     model = rail()
     model.configure(0.0, RailSettings(max_velocity=5 * STEPS, max_acceleration=20 * STEPS, soft_stop=soft))
     model.rotate(0.0, 5 * STEPS)
@@ -67,7 +67,7 @@ def test_a_limit_switch_stops_the_motor_at_once_or_on_the_ramp(soft: bool) -> No
 
 
 @pytest.mark.parametrize(("mode", "turns"), [(1, 0), (2, 52), (3, 52), (6, 0)])
-def test_a_search_of_both_switches_finds_their_distance(mode: int, turns: int) -> None:
+def test_a_search_of_both_switches_finds_their_distance(mode: int, turns: int):
     model = rail()
     model.configure(0.0, RailSettings(search_mode=mode))
     model.search(0.0)

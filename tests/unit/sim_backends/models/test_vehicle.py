@@ -19,7 +19,7 @@ def drive(model: VehicleModel, begin: float, end: float, speed: float, yaw_rate:
     model.tick(end)
 
 
-def test_one_that_is_bumped_into_stands_elsewhere_and_its_wheels_do_not_tell() -> None:
+def test_one_that_is_bumped_into_stands_elsewhere_and_its_wheels_do_not_tell():
     model = vehicle()
     model.push(1.0, 0.01, -0.02, 0.003)
     assert model.planar(1.0) == pytest.approx((-3.04, -0.02, 0.003))
@@ -27,7 +27,7 @@ def test_one_that_is_bumped_into_stands_elsewhere_and_its_wheels_do_not_tell() -
     assert model.world_from_vehicle(1.0)[:2, 3] == pytest.approx((-3.04, -0.02))
 
 
-def test_slip_is_seen_by_the_world_and_not_by_the_odometers() -> None:
+def test_slip_is_seen_by_the_world_and_not_by_the_odometers():
     model = vehicle(distance_scale=1.03, yaw_scale=0.9)
     model.set_mode(0.0, Mode.CAN)
     drive(model, 0.0, 5.0, 0.3)
@@ -42,7 +42,7 @@ def test_slip_is_seen_by_the_world_and_not_by_the_odometers() -> None:
     assert turned > 1.0
 
 
-def test_the_random_walk_grows_with_the_root_of_the_way() -> None:
+def test_the_random_walk_grows_with_the_root_of_the_way():
     headings = []
     for seed in range(30):
         model = vehicle(seed, yaw_walk=0.01)
@@ -53,7 +53,7 @@ def test_the_random_walk_grows_with_the_root_of_the_way() -> None:
     assert np.std(headings) == pytest.approx(0.01 * math.sqrt(way), rel=0.3)
 
 
-def test_the_pose_is_known_between_ticks_and_carries_the_sag() -> None:
+def test_the_pose_is_known_between_ticks_and_carries_the_sag():
     model = vehicle(start=(1.0, 2.0, math.pi / 2))
     model.sag = lambda: (0.01, 0.02, -0.003)
     model.tick(1.0)
@@ -69,7 +69,7 @@ def test_the_pose_is_known_between_ticks_and_carries_the_sag() -> None:
     assert late[1, 3] - early[1, 3] == pytest.approx(0.002, rel=0.01)
 
 
-def test_brake_and_emergency_stop_stop_hard_and_hold() -> None:
+def test_brake_and_emergency_stop_stop_hard_and_hold():
     for act in ("brake", "emergency"):
         model = vehicle(brake_deceleration=2.5)
         model.set_mode(0.0, Mode.CAN)

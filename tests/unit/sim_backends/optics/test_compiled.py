@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
 from numba.core import config
 
 from sim_backends.optics.compiled import _kept_there
@@ -20,7 +19,7 @@ print(fill_background.stats.cache_path)
 print(closest.stats.cache_path)"""
 
 
-def test_a_simulator_in_the_process_does_not_move_what_the_cell_keeps() -> None:
+def test_a_simulator_in_the_process_does_not_move_what_the_cell_keeps():
     """Else each of its kernels is compiled twice: for processes with a simulated cell in them, and for others."""
     plain = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     optics, cell = subprocess.check_output([sys.executable, "-c", SHOW], env=plain, text=True).split()
@@ -28,7 +27,7 @@ def test_a_simulator_in_the_process_does_not_move_what_the_cell_keeps() -> None:
     assert Path(cell).parts[-4:] == ("cell", "measure", "inversion", "__pycache__")
 
 
-def test_a_folder_that_the_user_names_holds_all(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_the_user_names_holds_all(monkeypatch):
     monkeypatch.setitem(vars(config), "CACHE_DIR", "/named")
     with _kept_there():
         assert config.CACHE_DIR == "/named"

@@ -6,7 +6,7 @@ from sim_backends.optics.pattern import grain_at, grain_parameters
 from sim_backends.optics.scene import Grain
 
 
-def test_dust_shades_a_few_places() -> None:
+def test_dust_shades_a_few_places():
     pattern = grain_parameters(0.6, Grain(spots=1.0))
     x, y = np.meshgrid(np.arange(-0.03, 0.03, 1e-4), np.arange(-0.03, 0.03, 1e-4))
     albedo = np.array([grain_at(a, b, pattern) for a, b in zip(x.ravel(), y.ravel(), strict=True)])

@@ -21,7 +21,7 @@ def echo(connection: socket.socket) -> None:
         connection.sendall(data)
 
 
-def test_who_vanishes_or_brings_an_error_about_costs_its_own_connection_only() -> None:
+def test_who_vanishes_or_brings_an_error_about_costs_its_own_connection_only():
     server = TcpServer("echo", echo)
     server.start()
     place = (server.host, server.port)
@@ -48,7 +48,7 @@ def whole(data: bytes, write: Callable[[bytes], object]) -> bytes:
     return data
 
 
-def test_a_serial_line_serves_a_terminal_and_a_socket_and_forgets_half_a_request() -> None:
+def test_a_serial_line_serves_a_terminal_and_a_socket_and_forgets_half_a_request():
     before = set(threading.enumerate())
     server = SerialServer("line", whole, pty=True)
     server.start()
@@ -64,7 +64,7 @@ def test_a_serial_line_serves_a_terminal_and_a_socket_and_forgets_half_a_request
     assert set(threading.enumerate()) == before
 
 
-def test_a_wrong_line_of_json_is_refused_with_its_reason_and_the_connection_stays() -> None:
+def test_a_wrong_line_of_json_is_refused_with_its_reason_and_the_connection_stays():
     peer = JsonLinesPeer("lines", {"tell": lambda request: {"first": request["rows"][0][0]}})
     peer.start()
     told = {

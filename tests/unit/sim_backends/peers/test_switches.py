@@ -3,7 +3,7 @@
 from sim_backends.peers.switches import LcusPeer, RelayBoard
 
 
-def test_a_board_of_four_bytes_switches_for_the_right_sum_only_and_never_answers() -> None:
+def test_a_board_of_four_bytes_switches_for_the_right_sum_only_and_never_answers():
     on = {1: False, 3: True}
     said: list[bytes] = []
     wired = {relay: (lambda value, r=relay: on.__setitem__(r, value), lambda r=relay: on[r]) for relay in on}

@@ -11,7 +11,7 @@ from sim_backends.peers.truth import truth_peer
 pytestmark = pytest.mark.wire
 
 
-def test_the_truth_endpoint_tells_the_truth_and_causes_faults() -> None:
+def test_the_truth_endpoint_tells_the_truth_and_causes_faults():
     faults: list[str] = []
     drawn: list[str] = []
     peer = truth_peer(

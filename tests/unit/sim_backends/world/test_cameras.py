@@ -18,7 +18,7 @@ def above(point: tuple[float, float, float]) -> np.ndarray:
     return drawing.pose(point, (1, 0, 0), (0, 0, -1))
 
 
-def test_the_stripe_follows_the_relief(ideal: StandingWorld) -> None:
+def test_the_stripe_follows_the_relief(ideal: StandingWorld):
     """Each lit pixel's ray, cut with the light plane, ends on the closed form of the surface."""
     world_from_camera = above((0.0, 0.0, 0.60 + 0.130))
     light = ideal.look("scan", world_from_camera, laser=True).astype(float) - ideal.look("scan", world_from_camera)
@@ -34,7 +34,7 @@ def test_the_stripe_follows_the_relief(ideal: StandingWorld) -> None:
     assert np.sqrt(np.mean((z - surface("pot").height(x, y))[on_it] ** 2)) < 1e-4
 
 
-def test_the_target_camera_sees_the_boards_dots_where_a_pinhole_puts_them(ideal: StandingWorld) -> None:
+def test_the_target_camera_sees_the_boards_dots_where_a_pinhole_puts_them(ideal: StandingWorld):
     world_from_board = drawing.WORLD_FROM_PLACE @ drawing.PLACE_FROM_BOARD
     world_from_camera = world_from_board @ drawing.pose((0.08, 0.06, -0.9), (1, 0, 0), (0, 0, 1))
     picture = ideal.look("target", world_from_camera, exposure=0.008).astype(float)

@@ -8,13 +8,13 @@ from sim_backends.world.drawing import STOCK, read
 from sim_backends.world.scene import draw
 
 
-def test_a_drawing_survives_its_text() -> None:
+def test_a_drawing_survives_its_text():
     assert read(STOCK.as_json()).as_json() == STOCK.as_json()
     with pytest.raises(ValueError, match="no drawing of a cell"):
         read('{"cell": 3}')
 
 
-def test_the_ideal_world_is_the_nominal_geometry() -> None:
+def test_the_ideal_world_is_the_nominal_geometry():
     scene = draw(11, "ideal")
     assert scene.world_from_surface == pytest.approx(drawing.WORLD_FROM_PLACE)
     assert scene.flange_from_scan_camera == pytest.approx(drawing.FLANGE_FROM_SCAN_CAMERA)
@@ -26,7 +26,7 @@ def test_the_ideal_world_is_the_nominal_geometry() -> None:
     assert scene.scan_lens.dist == (0, 0, 0, 0, 0)
 
 
-def test_the_board_faces_the_vehicle_and_up_with_its_centre_where_the_drawing_says() -> None:
+def test_the_board_faces_the_vehicle_and_up_with_its_centre_where_the_drawing_says():
     place_from_board = drawing.PLACE_FROM_BOARD
     centre = place_from_board @ [0.08, 0.06, 0.0, 1.0]
     assert centre[:3] == pytest.approx([0.10, 0.32, 0.12])

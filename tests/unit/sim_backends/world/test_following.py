@@ -52,7 +52,7 @@ def _drive(real: World, told: WorldFollowing, seconds: float) -> None:
             told.tell("vehicle", [[t, *_odometry(*real.vehicle.planar(t)), state.speed, state.yaw_rate, 0.0]])
 
 
-def test_the_world_stands_as_what_it_follows(pair: tuple[World, World, WorldFollowing]) -> None:
+def test_the_world_stands_as_what_it_follows(pair: tuple[World, World, WorldFollowing]):
     real, follower, told = pair
     told.begin_arm(None, 0)
     _drive(real, told, 1.0)
@@ -67,9 +67,7 @@ def test_the_world_stands_as_what_it_follows(pair: tuple[World, World, WorldFoll
     assert told.figures()["devices"]["rail"]["readings"] > 50
 
 
-def test_of_a_moment_that_nobody_told_of_there_is_no_picture(
-    pair: tuple[World, World, WorldFollowing], monkeypatch
-) -> None:
+def test_of_a_moment_that_nobody_told_of_there_is_no_picture(pair: tuple[World, World, WorldFollowing], monkeypatch):
     told = pair[2]
     monkeypatch.setattr("sim_backends.world.following.LONGEST_WAIT_S", 0.05)
     with pytest.raises(NotFollowed, match=r"no reading of the arm came within 0\.05 s"):
@@ -77,7 +75,7 @@ def test_of_a_moment_that_nobody_told_of_there_is_no_picture(
     assert told.figures()["not_made"] >= 1
 
 
-def test_in_a_gap_in_which_something_moved_there_is_no_picture(pair: tuple[World, World, WorldFollowing]) -> None:
+def test_in_a_gap_in_which_something_moved_there_is_no_picture(pair: tuple[World, World, WorldFollowing]):
     """The arm turned by 0.3 rad between two readings that are 0.2 s apart, and stood before and after."""
     real, _, told = pair
     t = max(0.0, told._tracks["arm"].until)
@@ -90,7 +88,7 @@ def test_in_a_gap_in_which_something_moved_there_is_no_picture(pair: tuple[World
         told.require("target", t + 0.8)
 
 
-def test_how_late_the_readings_came_is_told_as_it_is_documented(pair: tuple[World, World, WorldFollowing]) -> None:
+def test_how_late_the_readings_came_is_told_as_it_is_documented(pair: tuple[World, World, WorldFollowing]):
     figures = pair[2].figures()
     told = {f"following.{key}" for key in figures} | {f"following.devices.*.{key}" for key in figures["devices"]["arm"]}
     text = (ROOT / "docs" / "reference" / "report.md").read_text(encoding="utf-8")
@@ -98,9 +96,7 @@ def test_how_late_the_readings_came_is_told_as_it_is_documented(pair: tuple[Worl
     assert set(figures["devices"]["arm"]["latency_ms"]) == {"p50", "p99", "most"}
 
 
-def test_a_camera_that_does_not_ride_on_the_rail_does_not_wait_for_it(
-    pair: tuple[World, World, WorldFollowing],
-) -> None:
+def test_a_camera_that_does_not_ride_on_the_rail_does_not_wait_for_it(pair: tuple[World, World, WorldFollowing]):
     real, follower, told = pair
     t = told._tracks["arm"].until + 0.5
     told.tell("arm", [[t, *real.arm.drive.q, 0.0, 0.0]])
@@ -108,7 +104,7 @@ def test_a_camera_that_does_not_ride_on_the_rail_does_not_wait_for_it(
     assert follower.rail.carriage(t) == follower.rail.carriage(t - 0.4)
 
 
-def test_a_measured_board_brings_the_world_to_the_station(pair: tuple[World, World, WorldFollowing]) -> None:
+def test_a_measured_board_brings_the_world_to_the_station(pair: tuple[World, World, WorldFollowing]):
     _, follower, told = pair
     t = follower.arm.time
     measured = inverse(follower.world_from_base(t)) @ follower.scene.world_from_board
@@ -118,6 +114,6 @@ def test_a_measured_board_brings_the_world_to_the_station(pair: tuple[World, Wor
 
 
 @pytest.mark.parametrize("row", [[1.0], [1.0, 2.0, 3.0], [float("nan"), 1.0], ["x", 1.0]])
-def test_what_is_no_reading_is_refused(pair: tuple[World, World, WorldFollowing], row) -> None:
+def test_what_is_no_reading_is_refused(pair: tuple[World, World, WorldFollowing], row):
     with pytest.raises((ValueError, TypeError)):
         pair[2].tell("rail", [row])

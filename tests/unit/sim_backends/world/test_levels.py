@@ -20,7 +20,7 @@ from sim_backends.world.world import World
 RNG = np.random.default_rng(0)
 
 
-def test_every_effect_can_be_had_alone_and_workshop_has_all_but_the_options() -> None:
+def test_every_effect_can_be_had_alone_and_workshop_has_all_but_the_options():
     for name in Effects.names():
         alone = effects_of(f"nominal+{name}")
         assert getattr(alone, name) == getattr(ALONE, name) > 0
@@ -32,13 +32,13 @@ def test_every_effect_can_be_had_alone_and_workshop_has_all_but_the_options() ->
         assert effects_of(level) == Effects()
 
 
-def test_the_sun_has_20_to_100_klx_by_seed() -> None:
+def test_the_sun_has_20_to_100_klx_by_seed():
     drawn = [draw(seed, "outdoor").workshop.klx for seed in range(40)]
     assert 20.0 <= min(drawn) < 30.0 and 90.0 < max(drawn) <= 100.0
     assert draw(3, "workshop").workshop.klx == 0.0
 
 
-def test_in_the_open_gusts_come_and_go_the_ground_is_uneven_and_the_mount_grows() -> None:
+def test_in_the_open_gusts_come_and_go_the_ground_is_uneven_and_the_mount_grows():
     world = World(3, "outdoor", clock=SteppedClock())
     flat = World(3, "nominal", clock=SteppedClock())
     tilts = [np.linalg.inv(flat.world_from_base(0.0)) @ world.world_from_base(t) for t in np.arange(0.0, 10.0, 0.01)]
@@ -54,7 +54,7 @@ def test_in_the_open_gusts_come_and_go_the_ground_is_uneven_and_the_mount_grows(
 
 
 @pytest.mark.parametrize("effect", ["sheet_bow", "oil"])
-def test_an_effect_leaves_everything_else_as_it_was(effect: str) -> None:
+def test_an_effect_leaves_everything_else_as_it_was(effect: str):
     plain, one = draw(5, "nominal"), draw(5, f"nominal+{effect}")
     assert np.any(getattr(one.workshop, effect)) and not np.any(getattr(plain.workshop, effect))
     assert (one.light_plane_normal == plain.light_plane_normal).all()
@@ -62,7 +62,7 @@ def test_an_effect_leaves_everything_else_as_it_was(effect: str) -> None:
     assert deviations(f"nominal+{effect}") == deviations("nominal")
 
 
-def test_joints_are_off_by_seven_hundredths_of_a_milliradian() -> None:
+def test_joints_are_off_by_seven_hundredths_of_a_milliradian():
     off = []
     for seed in range(40):
         errors = JointErrors(Kinematics(UR10E_DH), draw(seed, "nominal+joint_harmonics").workshop.harmonics)
@@ -72,7 +72,7 @@ def test_joints_are_off_by_seven_hundredths_of_a_milliradian() -> None:
     assert np.sqrt(np.mean(np.square(off))) == pytest.approx(0.07e-3, rel=0.1)
 
 
-def test_the_vehicle_rocks_by_a_tenth_of_a_milliradian_about_four_times_a_second() -> None:
+def test_the_vehicle_rocks_by_a_tenth_of_a_milliradian_about_four_times_a_second():
     world = World(3, "nominal+rocking", clock=SteppedClock())
     # Leaning as it stands from the first tick on.
     times = np.arange(1.0, 11.0, 0.01)
@@ -85,7 +85,7 @@ def test_the_vehicle_rocks_by_a_tenth_of_a_milliradian_about_four_times_a_second
     assert np.fft.rfftfreq(len(times), 0.01)[int(np.argmax(power))] == pytest.approx(4.0, abs=0.6)
 
 
-def test_laser_and_cameras_drift_while_the_cell_stands_and_not_without_the_effects() -> None:
+def test_laser_and_cameras_drift_while_the_cell_stands_and_not_without_the_effects():
     for level, moves in (("nominal", False), ("nominal+laser_pointing+camera_warm_up", True)):
         world = World(4, level, clock=SteppedClock())
         before, lens = world.light_plane(0.0), world.lens("scan", 0.0)
@@ -100,7 +100,7 @@ def test_laser_and_cameras_drift_while_the_cell_stands_and_not_without_the_effec
             assert np.dot(after["normal"], world.scene.laser_origin) == pytest.approx(after["distance"], abs=1e-12)
 
 
-def test_texture_has_the_size_told_and_stays_on_the_surface() -> None:
+def test_texture_has_the_size_told_and_stays_on_the_surface():
     pattern = grain_parameters(0.6, Grain(texture=0.1))
     places = RNG.uniform(-0.05, 0.05, (4000, 2))
     albedo = np.array([grain_at(x, y, pattern) for x, y in places])
@@ -109,7 +109,7 @@ def test_texture_has_the_size_told_and_stays_on_the_surface() -> None:
     assert grain_at(*places[0], pattern) == albedo[0]
 
 
-def test_a_carriage_that_droops_sinks_and_rolls_by_its_way_and_nothing_else_changes() -> None:
+def test_a_carriage_that_droops_sinks_and_rolls_by_its_way_and_nothing_else_changes():
     plain, worn = (World(2, level, clock=SteppedClock()) for level in ("nominal", "nominal+droop"))
     for world in (plain, worn):
         world.rail.carriage = lambda t: t  # type: ignore[method-assign]
@@ -122,7 +122,7 @@ def test_a_carriage_that_droops_sinks_and_rolls_by_its_way_and_nothing_else_chan
     assert np.array_equal(plain.flange_from_camera("target", 0.1), worn.flange_from_camera("target", 0.1))
 
 
-def test_the_fan_ends_and_the_sun_moves() -> None:
+def test_the_fan_ends_and_the_sun_moves():
     assert only("sheet_ends").sheet_ends < np.deg2rad(30.0)
     world = World(1, "nominal+sunlight", clock=SteppedClock())
     facing = world.scene.world_from_surface @ drawing.pose((0.0, 0.0, 0.9), (1, 0, 0), (0, 0, -1))
@@ -133,7 +133,7 @@ def test_the_fan_ends_and_the_sun_moves() -> None:
     assert np.percentile(moved, 99.5) > 8.0 > 3.0 * np.median(moved)
 
 
-def test_beyond_the_shadow_s_edge_it_is_as_much_brighter_as_the_sun_is_than_the_sky() -> None:
+def test_beyond_the_shadow_s_edge_it_is_as_much_brighter_as_the_sun_is_than_the_sky():
     world = World(1, "nominal+sun", clock=SteppedClock())
     ground, base = world.scene.world_from_place, world.world_from_base(0.0)
 
@@ -148,28 +148,28 @@ def test_beyond_the_shadow_s_edge_it_is_as_much_brighter_as_the_sun_is_than_the_
 
 
 @pytest.mark.parametrize("effect", [*Effects.names(), "workshop"])
-def test_only_a_refusal_that_names_the_effect_is_excused(effect: str) -> None:
+def test_only_a_refusal_that_names_the_effect_is_excused(effect: str):
     elsewhere = "the arm, the camera and the laser's light: 3 points of the stripe cover the joint; held at the elbow"
     assert verdict({"outcome": "refused", "effect": effect, "reason": elsewhere}) == "refused"
 
 
-def test_a_refusal_that_names_rocking_is_one_by_its_name() -> None:
+def test_a_refusal_that_names_rocking_is_one_by_its_name():
     reason = f"the parts do not agree {likeliest([Cause('sway', 'the vehicle rocks at 4 Hz', 'line', 0.0, 0.9)])}"
     assert verdict({"outcome": "refused", "effect": "rocking", "reason": reason}) == "named"
 
 
-def test_ideal_deviates_in_nothing_but_read_noise() -> None:
+def test_ideal_deviates_in_nothing_but_read_noise():
     values = dataclasses.asdict(IDEAL)
     assert 0 < values.pop("read_noise") <= 0.2
     assert set(values.values()) == {0.0}
 
 
-def test_harsh_is_two_and_a_half_times_nominal() -> None:
+def test_harsh_is_two_and_a_half_times_nominal():
     for name, value in dataclasses.asdict(NOMINAL).items():
         assert getattr(HARSH, name) == pytest.approx(2.5 * value), name
 
 
-def test_unknown_levels_and_seeds_are_refused_with_the_choices() -> None:
+def test_unknown_levels_and_seeds_are_refused_with_the_choices():
     for level in ("noisy", "nominal+thunder", "workshop+grasp"):
         with pytest.raises(ValueError, match="choose"):
             effects_of(level)
@@ -179,7 +179,7 @@ def test_unknown_levels_and_seeds_are_refused_with_the_choices() -> None:
         draw(-1, "nominal")
 
 
-def test_nominal_deviations_scatter_as_the_table_says_and_are_cut() -> None:
+def test_nominal_deviations_scatter_as_the_table_says_and_are_cut():
     shifts, turns = [], []
     for seed in range(200):
         scene = draw(seed, "nominal")

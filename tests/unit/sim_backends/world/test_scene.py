@@ -15,7 +15,7 @@ def flat(value: object) -> np.ndarray:
     return np.asarray(value, dtype=float).ravel()
 
 
-def test_a_seed_fixes_the_whole_world_and_another_changes_it() -> None:
+def test_a_seed_fixes_the_whole_world_and_another_changes_it():
     assert (flat(draw(7, "nominal")) == flat(draw(7, "nominal"))).all()
     a, b = draw(7, "nominal"), draw(8, "nominal")
     for name in ("world_from_surface", "flange_from_scan_camera", "light_plane_normal", "dh_error", "rail_direction"):

@@ -12,7 +12,7 @@ from sim_backends.world.world import World, truth
 from tests.support.simulator.standing_world import StandingWorld
 
 
-def test_the_scan_camera_moves_along_the_rails_true_direction() -> None:
+def test_the_scan_camera_moves_along_the_rails_true_direction():
     world = StandingWorld("nominal")
     here = world.flange_from_camera("scan", 0.0)
     start = world.rail.carriage(0.0)
@@ -21,7 +21,7 @@ def test_the_scan_camera_moves_along_the_rails_true_direction() -> None:
     assert here[:3, :3].T @ moved / start == pytest.approx(world.scene.rail_direction)
 
 
-def test_the_arm_carries_laser_claw_and_grip_feedback_at_its_next_tick() -> None:
+def test_the_arm_carries_laser_claw_and_grip_feedback_at_its_next_tick():
     world = StandingWorld()
     t = world.arm.time
     world.arm.tick(t + 0.01)
@@ -34,7 +34,7 @@ def test_the_arm_carries_laser_claw_and_grip_feedback_at_its_next_tick() -> None
     assert not world.laser.at(t + 0.015) and world.laser.at(t + 0.025)
 
 
-def test_pressing_the_part_down_is_felt_upward_in_base_axes() -> None:
+def test_pressing_the_part_down_is_felt_upward_in_base_axes():
     world = StandingWorld()
     on_the_surface = drawing.inverse(world.base) @ world.scene.world_from_surface
     on_the_surface[2, 3] -= 0.0005
@@ -42,7 +42,7 @@ def test_pressing_the_part_down_is_felt_upward_in_base_axes() -> None:
     assert 5.0 < wrench[2] < 10.0
 
 
-def test_a_surface_that_is_pushed_lies_elsewhere_and_is_touched_there() -> None:
+def test_a_surface_that_is_pushed_lies_elsewhere_and_is_touched_there():
     world = StandingWorld()
     before = world.scene.world_from_surface.copy()
     by = np.eye(4)
@@ -56,7 +56,7 @@ def test_a_surface_that_is_pushed_lies_elsewhere_and_is_touched_there() -> None:
     assert 5.0 < world.arm.contact(there)[2] < 10.0
 
 
-def test_the_body_leans_towards_where_the_arm_reaches() -> None:
+def test_the_body_leans_towards_where_the_arm_reaches():
     world = World(seed=2, level="nominal")
     world.arm.tick(0.5)
     world.vehicle.tick(0.6)
@@ -67,7 +67,7 @@ def test_the_body_leans_towards_where_the_arm_reaches() -> None:
     assert up[1] * reach[1] >= 0
 
 
-def test_truth_is_complete_json_and_consistent() -> None:
+def test_truth_is_complete_json_and_consistent():
     world = World(seed=9, level="nominal")
     told = json.loads(json.dumps(truth(world)))
     pose = {name: np.array(value) for name, value in told["poses"].items()}
@@ -78,7 +78,7 @@ def test_truth_is_complete_json_and_consistent() -> None:
     assert told["part"]["held"] and not told["laser_on"] and told["vehicle"]["stopped"]
 
 
-def test_the_items_of_a_job_stand_on_one_table_each_with_its_part_until_that_was_taken() -> None:
+def test_the_items_of_a_job_stand_on_one_table_each_with_its_part_until_that_was_taken():
     def at(x: float, y: float, z: float) -> np.ndarray:
         return drawing.pose((x, y, z), (1, 0, 0), (0, 0, 1))
 
@@ -113,7 +113,7 @@ def test_the_items_of_a_job_stand_on_one_table_each_with_its_part_until_that_was
     assert world.parts == 2 and world._items[0].part.untouched, "the first one was taken: all is made ready again"
 
 
-def test_two_stations_stand_in_one_world_each_with_its_board_and_what_it_is_off_by() -> None:
+def test_two_stations_stand_in_one_world_each_with_its_board_and_what_it_is_off_by():
     there = drawing.pose((-2.75, -2.75, 0.0), (0, -1, 0), (0, 0, 1))
     nest = drawing.pose((-0.6, 0.0, 0.03), (1, 0, 0), (0, 0, 1))
     own = replace(drawing.STOCK.station, nest=nest, nest_filled=True, stop="left")

@@ -193,9 +193,8 @@ def _at(curve: Array, line: int) -> float:
 
 @compiled
 def _curve(centres: Array, sigma: Array, begin: int, rounds: int, made: Array) -> None:
-    """Parabola through the lines from `begin` to `begin + BLOCK` and those beside, into `made` (5,): three
-    coefficients, its origin (0 where too few lines have a centre) and the lines' scatter about it, px. Of one round it
-    is not robust."""
+    """Parabola through the lines from `begin` to `begin + BLOCK` and those beside, into `made` (5,): coefficients, its
+    origin (0 where too few lines have a centre), the lines' scatter about it in px. One round alone is not robust."""
     made[:] = 0.0
     low, high = max(0, begin - BESIDE), min(len(centres), begin + BLOCK + BESIDE)
     t, y, weight = np.empty(high - low), np.empty(high - low), np.empty(high - low)

@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 from importlib.metadata import version
-from pathlib import Path
 
 import pytest
 import typer
@@ -13,7 +12,7 @@ from cell.apps.cli import main
 
 
 @pytest.mark.parametrize("words", [["--help"], ["runs"], ["abort"], ["pause"], ["go-on"], ["confirm"]], ids=" ".join)
-def test_a_command_that_has_to_be_quick_loads_nothing_heavy(tmp_path: Path, words: list[str]) -> None:
+def test_a_command_that_has_to_be_quick_loads_nothing_heavy(tmp_path, words: list[str]):
     code = """
 import atexit, sys
 heavy = {"numpy", "cv2", "pinocchio", "scipy", "numba", "transitions"}
@@ -31,9 +30,7 @@ main()"""
 @pytest.mark.parametrize(
     ("option", "shown"), [("--version", version("assembly-cell")), ("--show-completion", "complete")]
 )
-def test_the_command_line_tells_its_release_and_completes(
-    option: str, shown: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_line_tells_its_release_and_completes(option: str, shown: str, monkeypatch, capsys):
     # Else typer looks among the processes above this one for a shell, and a test need not have one there.
     monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
     monkeypatch.setattr(sys, "argv", ["cell", option, *(["bash"] if "completion" in option else [])])
@@ -51,7 +48,7 @@ MODULES = {
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_commands_of_a_broken_package_do_not_take_the_others_with_them(tmp_path: Path, module: str) -> None:
+def test_commands_of_a_broken_package_do_not_take_the_others_with_them(tmp_path, module: str):
     info = tmp_path / "odd-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: odd\nVersion: 1.0\n")
@@ -69,9 +66,7 @@ def test_commands_of_a_broken_package_do_not_take_the_others_with_them(tmp_path:
     assert f"the commands of {module}:register cannot be used" in done.stderr
 
 
-def test_a_prompt_that_nobody_answers_is_told_in_words(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_prompt_that_nobody_answers_is_told_in_words(monkeypatch, capsys):
     def unanswered(*_: object, **__: object) -> None:
         raise typer.Abort
 

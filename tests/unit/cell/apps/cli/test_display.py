@@ -37,9 +37,7 @@ def shown(run: Ended, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize(("make", "outcome"), MAKES)
-def test_the_end_of_a_run_is_one_screen(
-    ends: Ends, make: Make, outcome: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_end_of_a_run_is_one_screen(ends: Ends, make: Make, outcome: str, capsys, monkeypatch):
     run = ends(make)
     monkeypatch.chdir(run.folder.parent.parent)
     lines = shown(run, capsys, monkeypatch).splitlines()
@@ -54,9 +52,7 @@ def test_the_end_of_a_run_is_one_screen(
     assert any(line.startswith("faults ") for line in lines)
 
 
-def test_a_placed_run_shows_what_was_measured_beside_its_limit(
-    ends: Ends, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_placed_run_shows_what_was_measured_beside_its_limit(ends: Ends, capsys, monkeypatch):
     text = shown(ends(report_runs.placed), capsys, monkeypatch)
     for name in ("place error, largest of 45 points", "place error, stated 95 % bound", "contact depth", "fit, χ²/dof",
                  "surface covered"):  # fmt: skip
@@ -68,9 +64,7 @@ def test_a_placed_run_shows_what_was_measured_beside_its_limit(
     assert "Handscan" not in text
 
 
-def test_the_noise_is_shown_where_it_is_asked_for(
-    ends: Ends, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_noise_is_shown_where_it_is_asked_for(ends: Ends, capsys, monkeypatch):
     assert "assumed noise" not in shown(ends(report_runs.placed), capsys, monkeypatch)
     assert "assumed noise" in shown(ends(report_runs.placed), capsys, monkeypatch, noise=True)
 
@@ -84,7 +78,7 @@ def test_the_noise_is_shown_where_it_is_asked_for(
         (report_runs.aborted, "cell resume"),
     ],
 )
-def test_what_to_type_next_depends_on_the_end(ends: Ends, make: Make, words: str) -> None:
+def test_what_to_type_next_depends_on_the_end(ends: Ends, make: Make, words: str):
     run = ends(make)
     screen = end_screen(run.report, run.folder)
     advice = next(k for k, line in enumerate(screen) if line.startswith("next"))
@@ -95,14 +89,14 @@ def test_what_to_type_next_depends_on_the_end(ends: Ends, make: Make, words: str
     ("part", "words"), [("released", "look at the part, it is down"), ("unknown", "what has become")]
 )
 @pytest.mark.parametrize("outcome", ["refused", "faulted", "aborted", "not ended"])
-def test_whoever_has_lost_a_part_is_not_told_to_resume(tmp_path: Path, outcome: str, part: str, words: str) -> None:
+def test_whoever_has_lost_a_part_is_not_told_to_resume(tmp_path, outcome: str, part: str, words: str):
     report = {"outcome": outcome, "reason": "a link broke", "job": "pot", "part": part, "simulated": False}
     text = "\n".join(end_screen(report, tmp_path))
     assert words in text
     assert "resume" not in text
 
 
-def test_what_became_of_the_part_of_a_killed_run_is_in_its_journal(tmp_path: Path) -> None:
+def test_what_became_of_the_part_of_a_killed_run_is_in_its_journal(tmp_path):
     journal = Journal(tmp_path, "run", {"job": "pot"})
     journal.event("note", "place", {"part": "unknown"})
     journal.close()
@@ -117,12 +111,12 @@ def test_what_became_of_the_part_of_a_killed_run_is_in_its_journal(tmp_path: Pat
          "then cell dry-run --seed 7 --level workshop --clock virtual -j pot"),
     ],
 )  # fmt: skip
-def test_a_refused_run_is_done_again_calibrated_or_in_its_own_world(tmp_path: Path, about: Any, words: str) -> None:
+def test_a_refused_run_is_done_again_calibrated_or_in_its_own_world(tmp_path, about: Any, words: str):
     report = {"outcome": "refused", "reason": "no", "job": "pot", **about}
     assert words in " ".join("\n".join(end_screen(report, tmp_path)).split())
 
 
-def test_what_a_screen_leaves_out_is_counted_and_the_report_has_it(ends: Ends) -> None:
+def test_what_a_screen_leaves_out_is_counted_and_the_report_has_it(ends: Ends):
     run = ends(report_runs.placed)
     rows = [{**run.report["measured"][0], "name": f"figure {k}"} for k in range(30)]
     long = {**run.report, "measured": rows, "reason": "it is so. " * 60}
@@ -133,7 +127,7 @@ def test_what_a_screen_leaves_out_is_counted_and_the_report_has_it(ends: Ends) -
     assert [sum("figure " in line for line in whole), " ".join(whole).count("it is so.")] == [30, 60]
 
 
-def test_a_reason_however_long_leaves_room_for_the_rest(ends: Ends) -> None:
+def test_a_reason_however_long_leaves_room_for_the_rest(ends: Ends):
     run = ends(report_runs.faulted)
     many = [{**run.report["faults"][0]}] * 30
     lines = end_screen({**run.report, "reason": "word " * 400, "faults": many}, run.folder)
@@ -142,7 +136,7 @@ def test_a_reason_however_long_leaves_room_for_the_rest(ends: Ends) -> None:
     assert any(line.startswith("faults    30: ") for line in lines)
 
 
-def test_a_run_without_steps_has_its_screen_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_without_steps_has_its_screen_too(tmp_path, capsys):
     print_report(CALIBRATION, str(tmp_path / "20260301T100000-0001"), noise=True)
     text = capsys.readouterr().out
     assert text.startswith("done  stored\ncalibration · 2 min on the wall")
@@ -152,7 +146,7 @@ def test_a_run_without_steps_has_its_screen_too(tmp_path: Path, capsys: pytest.C
 @pytest.mark.parametrize(
     ("seconds", "words"), [(None, ""), (3.21, "3.2 s"), (31.4, "31 s"), (125.0, "2 min"), (7300.0, "2 h 2 min")]
 )
-def test_durations_are_told_as_people_do(seconds: float | None, words: str) -> None:
+def test_durations_are_told_as_people_do(seconds: float | None, words: str):
     assert duration(seconds) == words
 
 
@@ -176,12 +170,12 @@ def spoiled(root: Path) -> dict[str, Path]:
 
 
 @pytest.fixture
-def root(here: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def root(here: Path, monkeypatch) -> Path:
     monkeypatch.setenv("COLUMNS", "80")
     return here / "runs"
 
 
-def test_one_bad_report_does_not_spoil_the_list(root: Path, typed: Typed) -> None:
+def test_one_bad_report_does_not_spoil_the_list(root: Path, typed: Typed):
     good = new_run(root)
     write_json(good / "report.json", {"run": good.name, "outcome": "placed", "job": "pot", "wall_s": 31.2})
     folders = spoiled(root)
@@ -201,7 +195,7 @@ def test_one_bad_report_does_not_spoil_the_list(root: Path, typed: Typed) -> Non
 
 
 @pytest.mark.parametrize("name", SPOILED)
-def test_a_report_that_cannot_be_read_is_an_error_in_our_words(root: Path, typed: Typed, name: str) -> None:
+def test_a_report_that_cannot_be_read_is_an_error_in_our_words(root: Path, typed: Typed, name: str):
     folder = spoiled(root)[name]
     code, _, said = typed("report", folder.name)
     assert code in (1, 2)
@@ -210,7 +204,7 @@ def test_a_report_that_cannot_be_read_is_an_error_in_our_words(root: Path, typed
     assert "Traceback" not in said
 
 
-def test_the_list_tells_when_what_how_and_how_long(root: Path, ends: Ends, typed: Typed) -> None:
+def test_the_list_tells_when_what_how_and_how_long(root: Path, ends: Ends, typed: Typed):
     for data in (CALIBRATION, ends(report_runs.too_strict).report):
         write_json(new_run(root) / "report.json", data)
     going_on = new_run(root)
@@ -235,7 +229,7 @@ def test_the_list_tells_when_what_how_and_how_long(root: Path, ends: Ends, typed
     assert max(map(len, text.splitlines())) <= 80
 
 
-def test_a_long_reason_keeps_what_to_do_about_it(tmp_path: Path) -> None:
+def test_a_long_reason_keeps_what_to_do_about_it(tmp_path):
     remedy = "Scan more of the surface, or photograph the board more often"
     reason = f"{'; '.join(f'translation {k} is not determined: 0.181 mm > 0.1 mm' for k in range(9))}. {remedy}"
     rows = [{"name": f"figure {k}", "value": 0.1, "unit": "mm", "limit": None} for k in range(20)]
@@ -245,7 +239,7 @@ def test_a_long_reason_keeps_what_to_do_about_it(tmp_path: Path) -> None:
     assert remedy in " ".join(end_screen({"outcome": "refused", "reason": reason}, tmp_path))
 
 
-def test_the_next_command_names_a_cell_that_is_elsewhere(tmp_path: Path) -> None:
+def test_the_next_command_names_a_cell_that_is_elsewhere(tmp_path):
     report = {"outcome": "aborted", "reason": "no", "job": "pot", "simulated": False}
     folder = tmp_path / "my cell" / "runs" / "20261124T120000-aaaa"
     folder.mkdir(parents=True)
@@ -270,8 +264,6 @@ def test_the_next_command_names_a_cell_that_is_elsewhere(tmp_path: Path) -> None
         ("refused", "no board", "another --seed draws another world; put that right, then cell dry-run -j pot"),
     ],
 )  # fmt: skip
-def test_after_a_simulated_calibration_the_next_command_fits_its_end(
-    tmp_path: Path, outcome: str, reason: str, words: str
-) -> None:
+def test_after_a_simulated_calibration_the_next_command_fits_its_end(tmp_path, outcome: str, reason: str, words: str):
     report = {"kind": "calibration", "outcome": outcome, "reason": reason, "simulated": True, "for_job": "pot"}
     assert next_step(report, tmp_path / "runs" / "20261124T120000-aaaa") == words

@@ -20,7 +20,7 @@ offered cell dry-run --inject arm.p"""
 
 
 @pytest.mark.skipif(not Path("/bin/bash").exists(), reason="there is no bash here")
-def test_bash_offers_runs_and_faults(tmp_path: Path) -> None:
+def test_bash_offers_runs_and_faults(tmp_path):
     for name in ("20260101T000000-00aa", "20260102T000000-00bb"):
         (tmp_path / "elsewhere" / name).mkdir(parents=True)
         (tmp_path / "elsewhere" / name / "journal.sqlite").write_text("")
@@ -37,7 +37,7 @@ def test_bash_offers_runs_and_faults(tmp_path: Path) -> None:
     assert told.stdout.splitlines() == ["00bb 00aa", "arm.protective_stop"], told.stderr
 
 
-def test_names_are_offered_and_nothing_where_something_is_wrong(here: Path) -> None:
+def test_names_are_offered_and_nothing_where_something_is_wrong(here: Path):
     (here / "mine.toml").write_text("[job]\n")
     (here / "cell.toml").write_text("[cell]\n")
     (here / "broken.toml").write_text("[job\n")

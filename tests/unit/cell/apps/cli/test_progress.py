@@ -4,7 +4,6 @@ import io
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -24,9 +23,7 @@ def rows(capsys: pytest.CaptureFixture[str], display: ProgressDisplay, *events: 
     return {line[2:].split()[0]: line for line in capsys.readouterr().err.splitlines() if line.strip()}
 
 
-def test_at_80_columns_bars_keep_their_place_and_ended_rows_look_ended(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_at_80_columns_bars_keep_their_place_and_ended_rows_look_ended(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "80")
     shown = rows(
         capsys,
@@ -50,9 +47,7 @@ def test_at_80_columns_bars_keep_their_place_and_ended_rows_look_ended(
     assert "[C153]" in shown["laser_sweep"]
 
 
-def test_a_first_run_shows_that_it_compiles_and_how_long_that_takes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_first_run_shows_that_it_compiles_and_how_long_that_takes(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr("cell.apps.cli.progress.LOOK_S", 0.01)
     told: list[str] = []
@@ -71,7 +66,7 @@ def test_a_first_run_shows_that_it_compiles_and_how_long_that_takes(
     assert len(kept_loops()) == 3
 
 
-def test_a_dry_run_says_something_before_it_loads_anything_heavy() -> None:
+def test_a_dry_run_says_something_before_it_loads_anything_heavy():
     code = """
 import sys, typer
 def said(text, err=False):
@@ -87,8 +82,8 @@ main()"""
 
 @pytest.mark.parametrize(("typed", "by_whom", "ended"), [(b"go\nready\n", True, None), (b"end\n", False, "terminal")])
 def test_a_question_is_answered_at_the_terminal_by_what_is_typed_after_it(
-    monkeypatch: pytest.MonkeyPatch, typed: bytes, by_whom: bool, ended: str | None
-) -> None:
+    monkeypatch, typed: bytes, by_whom: bool, ended: str | None
+):
     person, program = os.openpty()
 
     class Screen(io.StringIO):

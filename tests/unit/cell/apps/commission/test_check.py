@@ -1,7 +1,5 @@
 """What a check leaves: figures beside their limits, and a record that tells when it counts no more."""
 
-from pathlib import Path
-
 import pytest
 
 from cell.apps.commission.check import VERSION, Progress, Result
@@ -11,7 +9,7 @@ from cell.config.job import load_job
 from drivers.errors import ConfigError
 
 
-def test_a_figure_outside_its_limits_and_a_demand_that_is_not_met_make_a_check_wrong() -> None:
+def test_a_figure_outside_its_limits_and_a_demand_that_is_not_met_make_a_check_wrong():
     result = Result()
     result.measure("way", 4.96, "mm", least=4.95, most=5.05)
     result.require("claw shows the part", True)
@@ -26,13 +24,13 @@ def test_a_figure_outside_its_limits_and_a_demand_that_is_not_met_make_a_check_w
 @pytest.mark.parametrize(
     "text", ['{"version": 99}', '{"version": V}', "[]", '{"version": V, "results": {"links": {}}, "mended": []}']
 )
-def test_a_file_that_is_no_record_is_not_overwritten(tmp_path: Path, text: str) -> None:
+def test_a_file_that_is_no_record_is_not_overwritten(tmp_path, text: str):
     (tmp_path / "progress.json").write_text(text.replace("V", str(VERSION)))
     with pytest.raises(ConfigError, match="no record of a commissioning"):
         Progress(tmp_path, {"name": "x"}, load_job("pot")[0])
 
 
-def test_a_changed_configuration_makes_stale_what_rests_on_it_and_no_more(tmp_path: Path) -> None:
+def test_a_changed_configuration_makes_stale_what_rests_on_it_and_no_more(tmp_path):
     job, _ = load_job("pot")
     progress, config = Progress(tmp_path, {"name": "x"}, job), load_config(None)
     for check in CHECKS:

@@ -35,7 +35,7 @@ def views(hand: pin.SE3, pitch: float = 1.0, focal: float = 1.0, *, mirrored: bo
 
 
 @pytest.mark.parametrize("degrees", [0.0, 90.0, 180.0, -90.0, 37.0])
-def test_shifts_show_the_axes_and_the_board_and_turns_the_place(degrees: float) -> None:
+def test_shifts_show_the_axes_and_the_board_and_turns_the_place(degrees: float):
     hand = DRAWN * from_parts((0.012, -0.007, 0.004), turned((0.0, 0.0, 1.0), degrees))
     flanges, boards = views(hand, pitch=1.25)
     axes = axes_from_shifts(flanges[:7], boards[:7])
@@ -47,13 +47,13 @@ def test_shifts_show_the_axes_and_the_board_and_turns_the_place(degrees: float) 
     assert found.residual < 1e-9
 
 
-def test_a_wrong_lens_is_told_from_a_wrong_board() -> None:
+def test_a_wrong_lens_is_told_from_a_wrong_board():
     flanges, boards = views(DRAWN, pitch=1.0, focal=1.5)
     axes = axes_from_shifts(flanges[:7], boards[:7])
     assert (axes.across, axes.along) == (pytest.approx(1.0), pytest.approx(1.0 / 1.5))
 
 
-def test_a_mirrored_picture_and_shifts_along_two_axes_are_refused() -> None:
+def test_a_mirrored_picture_and_shifts_along_two_axes_are_refused():
     flanges, boards = views(DRAWN, mirrored=True)
     with pytest.raises(RefusedError, match="mirrored"):
         axes_from_shifts(flanges[:7], boards[:7])
@@ -75,14 +75,14 @@ def test_a_mirrored_picture_and_shifts_along_two_axes_are_refused() -> None:
         (lambda p: p * from_parts(np.zeros(3), turned((0.0, 0.0, 1.0), 40.0)), "turned by 40 deg against"),
     ],
 )  # fmt: skip
-def test_a_mounting_that_is_not_as_drawn_is_told_in_words_and_the_right_one_given(change: Any, words: str) -> None:
+def test_a_mounting_that_is_not_as_drawn_is_told_in_words_and_the_right_one_given(change: Any, words: str):
     really = change(DRAWN)
     told, right = against_drawing(really, DRAWN)
     assert (words in told) if words else (told == "")
     assert against_drawing(really, right)[0] == ""
 
 
-def test_where_a_rail_that_is_not_homed_carries_the_camera_is_no_fault_of_its_mounting() -> None:
+def test_where_a_rail_that_is_not_homed_carries_the_camera_is_no_fault_of_its_mounting():
     along = DRAWN * from_parts((0.07, 0.0, 0.0))
     assert "70 mm" in against_drawing(along, DRAWN)[0]
     assert against_drawing(along, DRAWN, (0.0, 0.1))[0] == ""

@@ -4,7 +4,6 @@ import re
 import tomllib
 from collections.abc import Callable
 from contextlib import closing
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,7 +16,7 @@ from tests.support import ROOT
 from tests.support.commissioning import Shown, commissioned, files, opened, replaced, same
 
 
-def test_a_wrong_payload_is_weighed_written_and_not_weighed_again(tmp_path: Path) -> None:
+def test_a_wrong_payload_is_weighed_written_and_not_weighed_again(tmp_path):
     files(tmp_path, replaced('payload = "2.1 kg"', 'payload = "4.3 kg"'))
     good, shown = commissioned(tmp_path, "payload")
     assert good
@@ -71,8 +70,8 @@ def mounting(camera: str, rotation: str) -> Callable[[str], str]:
     ],
 )
 def test_each_wrong_configuration_is_found_by_name_and_nothing_else_is(
-    tmp_path: Path, truth: Callable[[str], str], cell: Callable[[str], str], until: str, words: str
-) -> None:
+    tmp_path, truth: Callable[[str], str], cell: Callable[[str], str], until: str, words: str
+):
     files(tmp_path, truth, cell)
     good, shown = commissioned(tmp_path, until)
     assert good
@@ -95,7 +94,7 @@ CHANGES = {
 }  # fmt: skip
 
 
-def test_values_are_changed_and_everything_else_of_the_file_stays() -> None:
+def test_values_are_changed_and_everything_else_of_the_file_stays():
     text = default_toml()
     new = edited(text, CHANGES)
     wanted = tomllib.loads(text)
@@ -110,14 +109,14 @@ def test_values_are_changed_and_everything_else_of_the_file_stays() -> None:
     assert len(new.splitlines()) == len(text.splitlines())
 
 
-def test_a_value_over_several_lines_and_a_key_that_is_missing_are_written_too() -> None:
+def test_a_value_over_several_lines_and_a_key_that_is_missing_are_written_too():
     text = '[a]  # first\nlist = [\n  1,  # one\n  2,\n]\nb = "x # y"   # said\n\n[c.d]\ne = 1\n'
     new = edited(text, {"a.list": "[3]", "a.b": '"z"', "c.d.f": "2", "g.h": "true"})
     assert tomllib.loads(new) == {"a": {"list": [3], "b": "z"}, "c": {"d": {"e": 1, "f": 2}}, "g": {"h": True}}
     assert "# said" in new and "# first" in new
 
 
-def test_what_cannot_be_changed_without_risk_is_refused_with_what_to_write(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_changed_without_risk_is_refused_with_what_to_write(monkeypatch):
     with pytest.raises(ConfigError, match=r"a\.b = 2"):
         edited("a = 1\n", {"a.b": "2"})
     monkeypatch.setattr("tomlkit.value", lambda value: 3)
@@ -125,7 +124,7 @@ def test_what_cannot_be_changed_without_risk_is_refused_with_what_to_write(monke
         edited("[a]\nb = 1\n", {"a.b": "2"})
 
 
-def test_the_old_file_is_kept_each_time(tmp_path: Path) -> None:
+def test_the_old_file_is_kept_each_time(tmp_path):
     path = tmp_path / "cell.toml"
     path.write_text(default_toml(), encoding="utf-8")
     kept = [write_changes(path, {"rail.lead": f'"{k} mm"'}) for k in (3, 4)]
@@ -135,7 +134,7 @@ def test_the_old_file_is_kept_each_time(tmp_path: Path) -> None:
     assert load_config(path).rail.lead == pytest.approx(0.004)
 
 
-def test_every_check_says_what_moves_and_needs_only_earlier_ones() -> None:
+def test_every_check_says_what_moves_and_needs_only_earlier_ones():
     before: set[str] = set()
     for check in CHECKS:
         assert check.title and check.limit and check.moves
@@ -144,13 +143,13 @@ def test_every_check_says_what_moves_and_needs_only_earlier_ones() -> None:
         before.add(check.name)
 
 
-def test_the_documents_table_is_current() -> None:
+def test_the_documents_table_is_current():
     text = (ROOT / "docs" / "how-to" / "commission.md").read_text(encoding="utf-8")
     rows = [f"| `{c.name}` | {c.moves} | {c.far} | {c.fast} | {c.limit} |" for c in CHECKS]
     assert "\n".join(["| check | moves | how far | how fast | has to hold |", "|---|---|---|---|---|", *rows]) in text
 
 
-def test_what_rests_on_a_check_that_came_out_wrong_waits_though_it_was_good_before(tmp_path: Path) -> None:
+def test_what_rests_on_a_check_that_came_out_wrong_waits_though_it_was_good_before(tmp_path):
     files(tmp_path)
     good, _ = commissioned(tmp_path, "payload")
     assert good
@@ -162,7 +161,7 @@ def test_what_rests_on_a_check_that_came_out_wrong_waits_though_it_was_good_befo
 
 
 @pytest.mark.parametrize("check", ["outputs", "stops"])
-def test_what_a_person_would_not_do_is_not_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, check: str) -> None:
+def test_what_a_person_would_not_do_is_not_good(tmp_path, monkeypatch, check: str):
     files(tmp_path)
     made = opened(tmp_path, Shown())
     unwilling = ("Keep a hand below", "Press the emergency stop")

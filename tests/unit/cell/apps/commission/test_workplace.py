@@ -1,11 +1,9 @@
 """Where checks work: nothing moves there without a person's word."""
 
-from pathlib import Path
-
 from tests.support.commissioning import commissioned, files
 
 
-def test_nothing_moves_without_a_persons_word_and_what_needs_it_waits(tmp_path: Path) -> None:
+def test_nothing_moves_without_a_persons_word_and_what_needs_it_waits(tmp_path):
     files(tmp_path, lambda text: text)
     asked: list[str] = []
 

@@ -12,7 +12,7 @@ from tests.support.console.server import Served, serving
 
 
 @pytest.fixture(scope="module")
-def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
+def cell(tmp_path_factory) -> Iterator[Cell]:
     """Its runs lie in a folder of its own."""
     folder = tmp_path_factory.mktemp("cell")
     with pytest.MonkeyPatch.context() as patch:
@@ -32,7 +32,7 @@ def controller(cell: Cell) -> Iterator[ConsoleController]:
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def server(tmp_path_factory) -> Iterator[Served]:
     with serving(tmp_path_factory.mktemp("runs")) as served:
         yield served
 

@@ -1,7 +1,6 @@
 """Promises of `cell new-job` as a whole: the job fits the cell, and no file is lost."""
 
 import re
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -33,7 +32,7 @@ def waves(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return 8 + 3 * np.sin(x / 9 + 0.3) * np.cos(y / 11 - 0.5) + np.sin((x + 2 * y) / 16)
 
 
-def test_a_job_from_its_mesh_fits_the_cell_and_no_file_is_lost(tmp_path: Path) -> None:
+def test_a_job_from_its_mesh_fits_the_cell_and_no_file_is_lost(tmp_path):
     """In metres, wider than one sweep; written twice: only when that is said."""
     mesh = relief(tmp_path / "m.ply", waves)
     trimesh.load_mesh(mesh).apply_scale(1e-3).export(mesh)
@@ -49,9 +48,7 @@ def test_a_job_from_its_mesh_fits_the_cell_and_no_file_is_lost(tmp_path: Path) -
     assert made.job.read_text(encoding="utf-8") == written
 
 
-def test_the_mesh_of_the_part_goes_beside_the_job_and_has_to_fit_its_surface(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_mesh_of_the_part_goes_beside_the_job_and_has_to_fit_its_surface(tmp_path, monkeypatch):
     monkeypatch.setattr("cell.apps.new_job.make.draw_proposal", lambda *_: None)  # takes longest
     mesh = relief(tmp_path / "m.ply", waves, half=14.0)
     job, surface = load_job(from_options(tmp_path, mesh=str(mesh), name="lid", like="shell").job)
@@ -95,7 +92,7 @@ def made() -> Proposal:
 
 
 @pytest.fixture(scope="module")
-def drawn(made: Proposal, tmp_path_factory: pytest.TempPathFactory) -> tuple[Figure, np.ndarray]:
+def drawn(made: Proposal, tmp_path_factory) -> tuple[Figure, np.ndarray]:
     """The figure as it was written, and the pixels of its file."""
     kept: list[Figure] = []
     save = Figure.savefig
@@ -113,7 +110,7 @@ def lines(axes: Axes, colour: str) -> list[np.ndarray]:
     return [corners for corners in found if len(corners)]
 
 
-def test_the_sweeps_are_drawn_where_the_proposal_has_them(made: Proposal, drawn: tuple[Figure, np.ndarray]) -> None:
+def test_the_sweeps_are_drawn_where_the_proposal_has_them(made: Proposal, drawn: tuple[Figure, np.ndarray]):
     figure, pixels = drawn
     assert pixels.shape == (990, 1620, 3)
     assert sum("the arm at the first sweep" in axes.get_title() for axes in figure.axes) == 2
@@ -138,7 +135,7 @@ def test_the_sweeps_are_drawn_where_the_proposal_has_them(made: Proposal, drawn:
     assert f"camera {1e3 * made.job.scan.stand_off:.0f} mm above z = 0, 2 × 36 mm by the rail" in cut.get_title()
 
 
-def test_what_no_sweep_sees_and_the_part_are_shown(made: Proposal, drawn: tuple[Figure, np.ndarray]) -> None:
+def test_what_no_sweep_sees_and_the_part_are_shown(made: Proposal, drawn: tuple[Figure, np.ndarray]):
     above = drawn[0].axes[0]
     said = re.search(r"(\d+) % of the surface is seen", above.get_title())
     assert 30 < int(said[1]) < 95

@@ -1,7 +1,5 @@
 """Promises of `cell.apps.new_job.mesh_file`; the STEP files are written here from the standard."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -54,7 +52,7 @@ def step_of(box: trimesh.Trimesh, unit: str) -> str:
 
 
 @pytest.mark.parametrize(("unit", "metres"), [("mm", 1e-3), ("inch", 0.0254)])
-def test_a_step_file_tells_its_unit_and_which_way_is_up(tmp_path: Path, unit: str, metres: float) -> None:
+def test_a_step_file_tells_its_unit_and_which_way_is_up(tmp_path, unit: str, metres: float):
     pytest.importorskip("cascadio")
     path = tmp_path / "box.step"
     path.write_text(step_of(trimesh.creation.box((6.0, 4.0, 1.0)), unit), encoding="utf-8")
@@ -63,7 +61,7 @@ def test_a_step_file_tells_its_unit_and_which_way_is_up(tmp_path: Path, unit: st
     np.testing.assert_allclose(drawn.bodies[0].size, metres * np.array([6.0, 4.0, 1.0]), rtol=1e-5)
 
 
-def test_what_is_wrong_with_a_mesh_is_named_and_put_right(tmp_path: Path) -> None:
+def test_what_is_wrong_with_a_mesh_is_named_and_put_right(tmp_path):
     inside_out, turned, lone = (trimesh.creation.box((20.0, 10.0, 5.0)) for _ in range(3))
     inside_out.invert()
     faces = turned.faces.copy()
@@ -93,7 +91,7 @@ def test_what_is_wrong_with_a_mesh_is_named_and_put_right(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("corner", "far"), [(99, 1.0), (-3, 1.0), (2, 1e200)], ids=["one too many", "one from the end", "far away"]
 )
-def test_a_mesh_with_corners_that_it_cannot_have_is_refused(tmp_path: Path, corner: int, far: float) -> None:
+def test_a_mesh_with_corners_that_it_cannot_have_is_refused(tmp_path, corner: int, far: float):
     head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty double x\nproperty double y\nproperty double z\n"
     head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     (tmp_path / "one.ply").write_text(f"{head}0 0 0\n1 0 0\n0 {far} 0\n3 0 1 {corner}\n")

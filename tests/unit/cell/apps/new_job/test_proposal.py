@@ -1,7 +1,5 @@
 """Promises of `cell.apps.new_job.proposal`."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,7 @@ from drivers.errors import NotObservable
 from tests.unit.cell.apps.new_job.meshes import dish, from_options, relief
 
 
-def test_a_disc_is_refused_by_its_free_turn_however_coarsely_it_is_drawn(tmp_path: Path) -> None:
+def test_a_disc_is_refused_by_its_free_turn_however_coarsely_it_is_drawn(tmp_path):
     """Facets of the drawing are no relief of the part."""
     with pytest.raises(NotObservable, match="rotation about the z axis") as refused:
         from_options(tmp_path, mesh=str(dish(tmp_path / "dish.stl", 12)))
@@ -20,7 +18,7 @@ def test_a_disc_is_refused_by_its_free_turn_however_coarsely_it_is_drawn(tmp_pat
     assert sorted(path.name for path in tmp_path.iterdir()) == ["dish-refused.png", "dish.stl"]
 
 
-def test_what_takes_long_is_told_while_it_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_takes_long_is_told_while_it_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr("cell.apps.new_job.questions.PROGRESS_S", 0.0)
     monkeypatch.setattr("cell.apps.new_job.make.draw_proposal", lambda *_: None)
     told: list[str] = []

@@ -1,7 +1,5 @@
 """Promises of `cell.apps.new_job.questions`."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -14,18 +12,18 @@ from drivers.errors import ConfigError
 
 
 @pytest.mark.parametrize(("longest", "unit"), [(60.0, "mm"), (0.14, "m"), (5.0, "inch")])
-def test_a_unit_is_told_by_the_size_where_one_alone_makes_sense(longest: float, unit: str) -> None:
+def test_a_unit_is_told_by_the_size_where_one_alone_makes_sense(longest: float, unit: str):
     found, words = told_by_size(longest)
     assert found == unit and f"taken as {unit}" in words
 
 
 @pytest.mark.parametrize("longest", [16.0, 600.0, 0.001])
-def test_a_unit_that_the_size_does_not_tell_is_asked_for(longest: float) -> None:
+def test_a_unit_that_the_size_does_not_tell_is_asked_for(longest: float):
     with pytest.raises(ConfigError, match="--unit"):
         told_by_size(longest)
 
 
-def test_a_wrong_answer_is_told_and_asked_again() -> None:
+def test_a_wrong_answer_is_told_and_asked_again():
     answers = iter(["3", "200 mm", "0.5 mm"])
     told: list[str] = []
     asker = Asker({}, lambda question, default: next(answers), told.append)
@@ -45,7 +43,7 @@ OVER = {
 
 
 @pytest.mark.parametrize("case", OVER)
-def test_bodies_that_overlap_are_told_and_what_lies_double_counts_once(tmp_path: Path, case: str) -> None:
+def test_bodies_that_overlap_are_told_and_what_lies_double_counts_once(tmp_path, case: str):
     *boxes, overlap, area = OVER[case]
     made = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for size, at in boxes]
     path = tmp_path / "two.stl"

@@ -1,7 +1,5 @@
 """Promises of `cell.apps.new_job.surface`."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -10,7 +8,7 @@ from cell.apps.new_job.mesh_file import read_drawing
 from cell.apps.new_job.surface import lay, open_side
 
 
-def test_only_what_lies_open_from_above_is_kept(tmp_path: Path) -> None:
+def test_only_what_lies_open_from_above_is_kept(tmp_path):
     """A mushroom: its hat hides foot and stem. Seen from above is the square of its foot, no more and no less."""
     parts = [((60.0, 60.0, 4.0), 2.0), ((10.0, 10.0, 16.0), 12.0), ((30.0, 30.0, 4.0), 22.0)]
     boxes = [trimesh.creation.box(size, trimesh.transformations.translation_matrix((0, 0, z))) for size, z in parts]

@@ -51,7 +51,7 @@ def run(folder: Path, target: Target, workers: Here, first: int = 1, of: Qualifi
     return campaign(folder, target, first, of).run(RowStore(folder), lambda: workers, lambda prefix: None)
 
 
-def test_a_campaign_runs_what_is_missing_only(tmp_path: Path) -> None:
+def test_a_campaign_runs_what_is_missing_only(tmp_path):
     first = Here()
     assert run(tmp_path, Target(5), first).end == 5
     assert (first.begun, first.closed) == ([1, 2, 3, 4, 5], True)
@@ -64,7 +64,7 @@ def test_a_campaign_runs_what_is_missing_only(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), CellError("the scheduler is gone")], ids=["Ctrl-C", "lost"])
-def test_one_that_was_interrupted_or_lost_its_workers_goes_on(tmp_path: Path, error: BaseException) -> None:
+def test_one_that_was_interrupted_or_lost_its_workers_goes_on(tmp_path, error: BaseException):
     class Ends(Here):
         def ended(self) -> Iterator[Ended]:
             if len(self.begun) == 4:
@@ -80,7 +80,7 @@ def test_one_that_was_interrupted_or_lost_its_workers_goes_on(tmp_path: Path, er
     assert again.begun == [4, 5, 6]
 
 
-def test_rows_of_other_code_are_not_mixed_in(tmp_path: Path) -> None:
+def test_rows_of_other_code_are_not_mixed_in(tmp_path):
     run(tmp_path, Target(3), Here())
     newer, workers = QualifiedCode("pot", OF.job_hash, OF.configuration_hash, "code2"), Here()
     run(tmp_path, Target(2), workers, of=newer)
@@ -92,7 +92,7 @@ def test_rows_of_other_code_are_not_mixed_in(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("room", [1, 2, 7])
-def test_until_ends_at_the_same_seed_whatever_the_workers(tmp_path: Path, room: int) -> None:
+def test_until_ends_at_the_same_seed_whatever_the_workers(tmp_path, room: int):
     # Nine of ten are good; by the first seeds alone the interval is narrow enough at a multiple of ten.
     target = Target(500, 0.09)
     prefix = run(tmp_path, target, Here(room))
@@ -102,7 +102,7 @@ def test_until_ends_at_the_same_seed_whatever_the_workers(tmp_path: Path, room: 
     assert [one["seed"] for one in rows] == list(range(1, wanted + 1))
 
 
-def test_a_prefix_waits_for_its_first_seeds() -> None:
+def test_a_prefix_waits_for_its_first_seeds():
     prefix = Prefix(1, Target(3))
     for seed in (3, 2, 5, 0):
         prefix.take(seed, "placed")
@@ -112,7 +112,7 @@ def test_a_prefix_waits_for_its_first_seeds() -> None:
     assert (prefix.known, prefix.good, prefix.end) == (3, 2, 3)
 
 
-def test_a_worker_that_dies_is_tried_again_and_then_is_a_row(tmp_path: Path) -> None:
+def test_a_worker_that_dies_is_tried_again_and_then_is_a_row(tmp_path):
     # By others that kill it a worker may die once with a world that then dies once by itself: no reason to give it up.
     workers = Here(2, dies={2: 2, 3: 3})
     run(tmp_path, Target(4), workers)
@@ -123,7 +123,7 @@ def test_a_worker_that_dies_is_tried_again_and_then_is_a_row(tmp_path: Path) -> 
     assert rows[3]["code"] == "WorkerDied"
 
 
-def test_targets_from_the_command_line() -> None:
+def test_targets_from_the_command_line():
     assert (Target.of(None, None, None), Target.of(7, None, None)) == (Target(2000, 0.05), Target(7))
     for text in ("yield:±1%", "yield:1 %", "yield:+-1%"):
         assert Target.of(None, text, 300) == Target(300, 0.01)
@@ -134,7 +134,7 @@ def test_targets_from_the_command_line() -> None:
         Target.of(7, None, 300)
 
 
-def test_how_many_worlds_are_likely() -> None:
+def test_how_many_worlds_are_likely():
     prefix = Prefix(1, Target(2000, 0.01))
     assert prefix.likely_end == next(n for n in range(20, 2000, 10) if Share(n, n).half_width <= 0.01)
     assert Prefix(1, Target(7)).likely_end == 7

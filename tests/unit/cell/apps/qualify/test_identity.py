@@ -11,7 +11,7 @@ from drivers.errors import ConfigError
 from tests.support.qualified import OF
 
 
-def test_a_configuration_is_what_it_says(tmp_path: Path) -> None:
+def test_a_configuration_is_what_it_says(tmp_path):
     plain = configuration_hash(load_config(None))
     file = tmp_path / "cell.toml"
     file.write_text("# mine\n" + default_toml(), encoding="utf-8")
@@ -23,7 +23,7 @@ def test_a_configuration_is_what_it_says(tmp_path: Path) -> None:
     assert configuration_hash(slower) != plain
 
 
-def test_a_job_is_its_file_and_its_meshes(here: Path) -> None:
+def test_a_job_is_its_file_and_its_meshes(here: Path):
     config, shipped = load_config(None), job_path("pot")
     before = QualifiedCode.of("pot", config)
     assert before.code_hash == code_hash()
@@ -36,13 +36,13 @@ def test_a_job_is_its_file_and_its_meshes(here: Path) -> None:
     assert QualifiedCode.of("tray4#2", config).job == "tray4#2"
 
 
-def test_each_world_has_a_key_of_its_own() -> None:
+def test_each_world_has_a_key_of_its_own():
     keys = {OF.key(level, seed, how) for level in ("nominal", "harsh") for seed in (1, 2) for how in ("", "faults")}
     assert len(keys) == 8
     assert OF.key("nominal", 1) == OF.key("nominal", 1)
 
 
 @pytest.mark.parametrize(("first", "count"), [(1, 0), (-1, 5), (999_999, 2)])
-def test_seeds_that_are_none_are_refused(first: int, count: int) -> None:
+def test_seeds_that_are_none_are_refused(first: int, count: int):
     with pytest.raises(ConfigError, match="allowed"):
         require_seeds(first, count)

@@ -1,7 +1,6 @@
 """The tables that people read, and the page: one file that asks nobody for anything, what was typed escaped."""
 
 import re
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,7 +12,7 @@ from tests.support.qualified import row
 from tests.unit.cell.apps.qualify.test_answer import answer, some
 
 
-def test_every_row_has_all_columns_and_units() -> None:
+def test_every_row_has_all_columns_and_units():
     made = {table.title: table for table in tables_of(some())}
     for table in made.values():
         assert {len(row) for row in table.rows} <= {len(table.columns)}, table.title
@@ -27,13 +26,13 @@ def test_every_row_has_all_columns_and_units() -> None:
     assert reasons[0] == ("2", "refused", "invert_pose", "the fit is … mm off, allowed are … mm", "7")
 
 
-def test_of_many_worst_worlds_some_are_shown() -> None:
+def test_of_many_worst_worlds_some_are_shown():
     bad = answer(*(row(seed, "refused", reason="dark") for seed in range(1, 31)))
     table = next(one for one in tables_of(bad) if one.title.startswith("the worst worlds"))
     assert (table.title, len(table.rows)) == (f"the worst worlds, {page.MOST_WORLDS} of 30", page.MOST_WORLDS)
 
 
-def test_a_comparison_tells_its_signs() -> None:
+def test_a_comparison_tells_its_signs():
     made = list(comparison_tables(compare([row(1, error_mm=0.2), row(2, "refused")], [row(1), row(2)])))
     told = {row[0]: row[1:] for row in made[0].rows}
     assert told["yield"][0] == "-50.0 %"
@@ -41,7 +40,7 @@ def test_a_comparison_tells_its_signs() -> None:
     assert made[1].rows == [("2", "placed", "refused", "")]
 
 
-def test_a_page_holds_plots_tables_and_commands(tmp_path: Path) -> None:
+def test_a_page_holds_plots_tables_and_commands(tmp_path):
     rows = [*(row(seed, error_mm=0.01 * seed) for seed in range(1, 30)), row(30, "refused", reason="<b>dark</b>")]
     told = answer(*rows)
     assert write_page(tmp_path, told, rows) == tmp_path / PAGE
@@ -54,7 +53,7 @@ def test_a_page_holds_plots_tables_and_commands(tmp_path: Path) -> None:
         assert words in text
 
 
-def test_plots_are_pictures_also_of_one_world_and_of_none_that_placed() -> None:
+def test_plots_are_pictures_also_of_one_world_and_of_none_that_placed():
     for rows in ([row(1)], [row(1, "refused")]):
         for plot in plots_of(answer(*rows), rows):
             image = cv2.imdecode(np.frombuffer(plot.png, np.uint8), cv2.IMREAD_COLOR)

@@ -25,7 +25,7 @@ def report(outcome: str = "placed", error: float = 0.2, **more: Any) -> dict[str
     }  # fmt: skip
 
 
-def test_a_row_has_what_the_report_says() -> None:
+def test_a_row_has_what_the_report_says():
     row = row_of(OF, "nominal", 7, [report()], covered=0.9)
     assert row["key"] == OF.key("nominal", 7)
     assert (row["outcome"], row["reason"], row["corrections"], row["retries"]) == ("placed", "", 1, 1)
@@ -34,7 +34,7 @@ def test_a_row_has_what_the_report_says() -> None:
     assert (row["stated_bound_mm"], row["tolerance_mm"]) == (0.3, 0.6)
 
 
-def test_a_job_of_several_items_is_as_good_as_its_worst() -> None:
+def test_a_job_of_several_items_is_as_good_as_its_worst():
     refused = report("refused", 0.5, truth=None)
     refused["steps"][0]["state"] = "failed"
     row = row_of(OF, "nominal", 7, [report(error=0.4), refused, report(error=0.1)])
@@ -42,14 +42,14 @@ def test_a_job_of_several_items_is_as_good_as_its_worst() -> None:
     assert (row["true_error_max_mm"], row[ERROR], row["cycle_s"]) == (0.4, 0.5, 150.0)
 
 
-def test_a_figure_uses_a_share_of_its_limit() -> None:
+def test_a_figure_uses_a_share_of_its_limit():
     assert used(ERROR, -0.3, 0.6, " at most") == 0.5
     assert used(COVERED, 90.0, 60.0, " at least") == 0.25, "the best is 100 %"
     assert used("points [1]", 200.0, 100.0, " at least") == 0.5
 
 
 @pytest.mark.parametrize(("name", "unit"), [("place error, stated 95 % bound", "mm"), ("fit, χ²/dof", "")])
-def test_a_column_tells_its_figure_and_its_unit(name: str, unit: str) -> None:
+def test_a_column_tells_its_figure_and_its_unit(name: str, unit: str):
     assert shown(column(name, unit)) == (name, unit)
 
 
@@ -60,7 +60,7 @@ def seeds(store: RowStore) -> list[int]:
     return sorted(int(str(one["seed"])) for one in store.rows())
 
 
-def test_rows_come_back_as_they_were(tmp_path: Path) -> None:
+def test_rows_come_back_as_they_were(tmp_path):
     store, rows = RowStore(tmp_path), [row(1), row(2, "refused", reason="too dark")]
     for one in rows:
         store.append(one)
@@ -68,9 +68,7 @@ def test_rows_come_back_as_they_were(tmp_path: Path) -> None:
     assert (store.outcomes(level="nominal"), store.rows(level="harsh")) == ({1: "placed", 2: "refused"}, [])
 
 
-def test_a_kill_between_writing_and_renaming_loses_that_row_only(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kill_between_writing_and_renaming_loses_that_row_only(tmp_path, monkeypatch):
     store = RowStore(tmp_path)
     store.append(row(1))
 
@@ -92,7 +90,7 @@ def test_a_kill_between_writing_and_renaming_loses_that_row_only(
     assert not list(store.folder.glob("*.tmp"))
 
 
-def test_a_kill_while_files_are_folded_doubles_no_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kill_while_files_are_folded_doubles_no_row(tmp_path, monkeypatch):
     store = RowStore(tmp_path)
     for seed in range(5):
         store.append(row(seed))
@@ -106,7 +104,7 @@ def test_a_kill_while_files_are_folded_doubles_no_row(tmp_path: Path, monkeypatc
     assert seeds(RowStore(tmp_path)) == list(range(5))
 
 
-def test_small_files_are_folded_now_and_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_small_files_are_folded_now_and_then(tmp_path, monkeypatch):
     monkeypatch.setattr(stores, "SMALL", 4)
     store = RowStore(tmp_path)
     for seed in range(10):
@@ -115,7 +113,7 @@ def test_small_files_are_folded_now_and_then(tmp_path: Path, monkeypatch: pytest
     assert seeds(store) == list(range(10))
 
 
-def test_columns_of_all_rows_are_there_for_others(tmp_path: Path) -> None:
+def test_columns_of_all_rows_are_there_for_others(tmp_path):
     store = RowStore(tmp_path)
     with store.writing():
         for one in (row(1, "refused"), row(2), row(3, note_mm=1.5)):
@@ -125,7 +123,7 @@ def test_columns_of_all_rows_are_there_for_others(tmp_path: Path) -> None:
     assert table.num_rows == 3
 
 
-def test_two_campaigns_do_not_write_into_one_folder(tmp_path: Path) -> None:
+def test_two_campaigns_do_not_write_into_one_folder(tmp_path):
     with (
         RowStore(tmp_path).writing(),
         pytest.raises(ConfigError, match="another campaign"),
@@ -134,7 +132,7 @@ def test_two_campaigns_do_not_write_into_one_folder(tmp_path: Path) -> None:
         pass
 
 
-def test_what_is_wrong_with_the_folder_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_wrong_with_the_folder_is_told(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="name another folder"):
         RowStore(tmp_path / "file")

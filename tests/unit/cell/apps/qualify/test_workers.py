@@ -30,11 +30,11 @@ def require_same(found: dict[int, Row], folder: Path) -> None:
     assert found == {seed: quick(campaign(folder, Target(1)).task(seed)) for seed in found}
 
 
-def test_a_process_that_dies_takes_no_other_world_with_it(tmp_path: Path) -> None:
+def test_a_process_that_dies_takes_no_other_world_with_it(tmp_path):
     require_same(rows(tmp_path, Processes(2, deadly), 4), tmp_path)
 
 
-def test_a_process_that_died_or_has_run_enough_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_died_or_has_run_enough_is_replaced(tmp_path, monkeypatch):
     workers, wanted = Processes(1, quick), campaign(tmp_path, Target(3))
     workers.begin(wanted.task(1))
     assert [row and row["seed"] for _, row in workers.ended()] == [1]
@@ -55,7 +55,7 @@ def test_a_process_that_died_or_has_run_enough_is_replaced(tmp_path: Path, monke
     assert not active_children()
 
 
-def test_a_worker_with_other_files_ends_the_campaign(tmp_path: Path) -> None:
+def test_a_worker_with_other_files_ends_the_campaign(tmp_path):
     with pytest.raises(ConfigError, match="another code"):
         rows(tmp_path, Processes(1, other_code))
 
@@ -70,22 +70,22 @@ def test_a_worker_with_other_files_ends_the_campaign(tmp_path: Path) -> None:
         ((None, None, "local:0"), "allowed: 1 to 1024"),
     ],
 )
-def test_what_names_no_workers_is_refused(given: tuple[int | None, str | None, str | None], told: str) -> None:
+def test_what_names_no_workers_is_refused(given: tuple[int | None, str | None, str | None], told: str):
     with pytest.raises(ConfigError, match=told):
         open_workers(*given)
 
 
-def test_without_dask_a_cluster_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_dask_a_cluster_says_what_to_install(monkeypatch):
     monkeypatch.setattr(module, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"pip install -e '.\[cluster\]'"):
         open_workers(None, None, "local:2")
 
 
-def test_by_default_each_core_has_a_process() -> None:
+def test_by_default_each_core_has_a_process():
     assert open_workers(None, None, None).room == module.cores()
 
 
-def test_a_cluster_gives_the_same_rows_although_workers_are_killed(tmp_path: Path) -> None:
+def test_a_cluster_gives_the_same_rows_although_workers_are_killed(tmp_path):
     cluster = open_workers(None, None, "local:2")
     assert isinstance(cluster, Cluster)
     cluster.work = deadly
@@ -93,7 +93,7 @@ def test_a_cluster_gives_the_same_rows_although_workers_are_killed(tmp_path: Pat
     assert (tmp_path / "killed").exists()
 
 
-def test_a_scheduler_that_goes_away_leaves_the_rows_and_says_how_to_go_on(tmp_path: Path) -> None:
+def test_a_scheduler_that_goes_away_leaves_the_rows_and_says_how_to_go_on(tmp_path):
     started = distributed.LocalCluster(n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None)
     cluster = open_workers(None, started.scheduler_address, None)
     assert isinstance(cluster, Cluster)
@@ -110,13 +110,13 @@ def test_a_scheduler_that_goes_away_leaves_the_rows_and_says_how_to_go_on(tmp_pa
     assert 3 <= len(RowStore(tmp_path).rows()) < 500
 
 
-def test_where_no_scheduler_answers_its_address_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_no_scheduler_answers_its_address_is_told(monkeypatch):
     monkeypatch.setattr(module, "ANSWER_S", "1s")
     with pytest.raises(ConfigError, match=r"no scheduler answers at tcp://127\.0\.0\.1:1"):
         open_workers(None, "tcp://127.0.0.1:1", None)
 
 
-def test_without_certificates_tls_says_what_is_missing() -> None:
+def test_without_certificates_tls_says_what_is_missing():
     with pytest.raises(ConfigError, match="give Dask its certificates"):
         open_workers(None, "tls://127.0.0.1:1", None)
 

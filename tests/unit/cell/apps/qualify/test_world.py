@@ -22,7 +22,7 @@ SEED = 2
 
 
 @pytest.fixture(scope="module")
-def task(tmp_path_factory: pytest.TempPathFactory) -> WorldTask:
+def task(tmp_path_factory) -> WorldTask:
     """The job `pot`, swept in a quarter of the lines shipped."""
     folder = tmp_path_factory.mktemp("qualify")
     job = str(quick_job("pot", folder, 15.0))
@@ -35,7 +35,7 @@ def row(task: WorldTask) -> Row:
     return run_world(task)
 
 
-def test_a_world_is_a_row(row: Row, task: WorldTask) -> None:
+def test_a_world_is_a_row(row: Row, task: WorldTask):
     assert (row["outcome"], row["reason"], row["key"]) == ("placed", "", task.key)
     error, bound = row["true_error_max_mm"], row["stated_bound_mm"]
     assert 0.0 < error < bound < 0.6
@@ -43,22 +43,20 @@ def test_a_world_is_a_row(row: Row, task: WorldTask) -> None:
     assert row["wall_s"] > 0.0
 
 
-def test_of_its_runs_nothing_is_kept_but_the_calibration(row: Row, task: WorldTask) -> None:
+def test_of_its_runs_nothing_is_kept_but_the_calibration(row: Row, task: WorldTask):
     kept = sorted(path.name for path in task.folder.rglob("*") if path.is_file())
     assert kept[1:] == ["cell.toml"]
     assert kept[0].endswith("-TARGET.json")
 
 
-def test_again_it_is_the_same_without_another_calibration(
-    row: Row, task: WorldTask, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_again_it_is_the_same_without_another_calibration(row: Row, task: WorldTask, monkeypatch):
     monkeypatch.setattr(Cell, "calibrate", None)
     again = run_world(task)
     assert again is not None
     assert compared(again) == compared(row)
 
 
-def test_its_command_repeats_it(row: Row, task: WorldTask, here: Path, typed: Typed) -> None:
+def test_its_command_repeats_it(row: Row, task: WorldTask, here: Path, typed: Typed):
     words = repeat_command(row, task.job, str(task.config_file)).split()[1:]
     code, out, _ = typed(*words, "--json")
     assert code == 0
@@ -67,7 +65,7 @@ def test_its_command_repeats_it(row: Row, task: WorldTask, here: Path, typed: Ty
     assert report["cell_s"] == row["cycle_s"]
 
 
-def test_what_a_run_raises_is_a_row(task: WorldTask, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_run_raises_is_a_row(task: WorldTask, monkeypatch):
     def raises(error: BaseException) -> Row | None:
         def work(*_: object) -> None:
             raise error
@@ -83,7 +81,7 @@ def test_what_a_run_raises_is_a_row(task: WorldTask, monkeypatch: pytest.MonkeyP
     assert scratch["reason"] == "OSError: no room in WORLD/calibrations", "the same in whichever folder"
 
 
-def test_a_calibration_that_is_refused_is_a_row(task: WorldTask, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_calibration_that_is_refused_is_a_row(task: WorldTask, monkeypatch):
     def refused(*_: object) -> None:
         raise RefusedError("the board is too dark")
 
@@ -92,7 +90,7 @@ def test_a_calibration_that_is_refused_is_a_row(task: WorldTask, monkeypatch: py
     assert (made["outcome"], made["step"], made["reason"]) == ("refused", "calibrate", "the board is too dark")
 
 
-def test_a_worker_of_another_version_runs_nothing(task: WorldTask) -> None:
+def test_a_worker_of_another_version_runs_nothing(task: WorldTask):
     with pytest.raises(ConfigError, match="install the same release"):
         run_world(replace(task, of=replace(task.of, code_hash="another")))
     with pytest.raises(ConfigError, match="cannot read"):

@@ -21,7 +21,7 @@ def found(folder: Path) -> CellCalibration:
     return find_calibration(folder, DEVICES, CONFIGURATION, MAX_AGE)
 
 
-def test_of_several_the_newest_is_taken(tmp_path: Path) -> None:
+def test_of_several_the_newest_is_taken(tmp_path):
     stored = [made(age * DAY) for age in (3, 1, 2)]
     for k, calibration in enumerate(stored):
         save_calibration(calibration, tmp_path / f"{k}.json")
@@ -51,20 +51,20 @@ def of(**other: str) -> CellCalibration:
         ([made(-2 * DAY)], r"\d\d\.\d hours in the future"),
     ],
 )
-def test_one_that_does_not_fit_is_not_taken(tmp_path: Path, stored: list[CellCalibration], says: str) -> None:
+def test_one_that_does_not_fit_is_not_taken(tmp_path, stored: list[CellCalibration], says: str):
     for k, calibration in enumerate(stored):
         save_calibration(calibration, tmp_path / f"{k}.json")
     with pytest.raises(CalibrationStale, match=says):
         found(tmp_path)
 
 
-def test_one_is_taken_up_to_its_greatest_age(tmp_path: Path) -> None:
+def test_one_is_taken_up_to_its_greatest_age(tmp_path):
     save_calibration(made(MAX_AGE - 60.0), tmp_path / "own.json")
     found(tmp_path)
 
 
 @pytest.mark.parametrize(("kept", "now"), [("UR10e 0a1b", "UR10e 2c3d"), ("", "UR10e 2c3d"), ("UR10e 0a1b", "")])
-def test_that_of_another_kinematics_of_the_arm_is_not_taken(tmp_path: Path, kept: str, now: str) -> None:
+def test_that_of_another_kinematics_of_the_arm_is_not_taken(tmp_path, kept: str, now: str):
     save_calibration(replace(made(), kinematics=kept), tmp_path / "own.json")
     with pytest.raises(CalibrationStale, match="another kinematics of the arm") as caught:
         find_calibration(tmp_path, DEVICES, CONFIGURATION, MAX_AGE, now)
@@ -73,7 +73,7 @@ def test_that_of_another_kinematics_of_the_arm_is_not_taken(tmp_path: Path, kept
     assert find_calibration(tmp_path, DEVICES, CONFIGURATION, MAX_AGE, kept).kinematics == kept
 
 
-def test_an_arm_that_was_not_asked_is_asked_again_before_anything_is_calibrated_anew(tmp_path: Path) -> None:
+def test_an_arm_that_was_not_asked_is_asked_again_before_anything_is_calibrated_anew(tmp_path):
     save_calibration(replace(made(), kinematics="UR10e 0a1b"), tmp_path / "own.json")
     why = "port 30001 of 10.0.0.5 sent none within 10 s"
     with pytest.raises(NotConnectedError, match=f"30001 was not read now: {why}; .*UR10e 0a1b.*connect anew") as caught:
@@ -83,7 +83,7 @@ def test_an_arm_that_was_not_asked_is_asked_again_before_anything_is_calibrated_
         find_calibration(tmp_path / "none", DEVICES, CONFIGURATION, MAX_AGE, "UR10e as drawn", why)
 
 
-def test_a_newer_one_that_does_not_fit_does_not_hide_the_own_one(tmp_path: Path) -> None:
+def test_a_newer_one_that_does_not_fit_does_not_hide_the_own_one(tmp_path):
     own = made(5 * DAY)
     save_calibration(own, tmp_path / "own.json")
     save_calibration(made(configuration=OTHER), tmp_path / "a.json")
@@ -103,9 +103,7 @@ spoilt_ways = pytest.mark.parametrize(
 
 
 @spoilt_ways
-def test_a_file_of_another_format_or_with_a_number_missing_is_none(
-    tmp_path: Path, spoilt: Callable[[dict[str, Any]], str]
-) -> None:
+def test_a_file_of_another_format_or_with_a_number_missing_is_none(tmp_path, spoilt: Callable[[dict[str, Any]], str]):
     path = tmp_path / "own.json"
     save_calibration(made(), path)
     path.write_text(spoilt(json.loads(path.read_text(encoding="utf-8"))), encoding="utf-8")
@@ -118,22 +116,22 @@ def test_a_file_of_another_format_or_with_a_number_missing_is_none(
     [(("scan_camera", "laser"), ()), ((), ("scan_camera",)), (("scan_camera",), ("scan_camera", "rail"))],
 )
 def test_one_with_simulated_devices_is_none_of_the_real_ones_nor_the_other_way_round(
-    tmp_path: Path, stored: tuple[str, ...], now: tuple[str, ...]
-) -> None:
+    tmp_path, stored: tuple[str, ...], now: tuple[str, ...]
+):
     save_calibration(made(devices=marked(DEVICES, stored)), tmp_path / "own.json")
     with pytest.raises(CalibrationStale, match="no calibration of these devices"):
         find_calibration(tmp_path, marked(DEVICES, now), CONFIGURATION, MAX_AGE)
     assert find_calibration(tmp_path, marked(DEVICES, stored), CONFIGURATION, MAX_AGE).identities["arm"] == "A1"
 
 
-def test_another_cells_edited_file_does_not_hide_the_own_one(tmp_path: Path) -> None:
+def test_another_cells_edited_file_does_not_hide_the_own_one(tmp_path):
     save_calibration(made(), tmp_path / "own.json")
     save_calibration(of(arm="B7"), tmp_path / "other.json")
     edited(tmp_path / "other.json", "made", value=1.7e9)
     assert found(tmp_path).identities == DEVICES
 
 
-def test_an_edited_copy_does_not_hide_the_intact_one(tmp_path: Path) -> None:
+def test_an_edited_copy_does_not_hide_the_intact_one(tmp_path):
     own = made()
     save_calibration(own, tmp_path / "own.json")
     save_calibration(made(0.5 * DAY), tmp_path / "copy.json")
@@ -144,7 +142,7 @@ def test_an_edited_copy_does_not_hide_the_intact_one(tmp_path: Path) -> None:
     assert note in found(tmp_path).summary()["notes"]
 
 
-def test_an_edited_file_of_the_cell_itself_is_refused_beside_any_copy(tmp_path: Path) -> None:
+def test_an_edited_file_of_the_cell_itself_is_refused_beside_any_copy(tmp_path):
     path = tmp_path / f"{made().name}.json"
     save_calibration(made(), path)
     save_calibration(made(0.5 * DAY), tmp_path / "copy.json")
@@ -155,8 +153,8 @@ def test_an_edited_file_of_the_cell_itself_is_refused_beside_any_copy(tmp_path: 
 
 @spoilt_ways
 def test_an_older_copy_does_not_stand_in_for_the_cells_own_file_that_cannot_be_read(
-    tmp_path: Path, spoilt: Callable[[dict[str, Any]], str]
-) -> None:
+    tmp_path, spoilt: Callable[[dict[str, Any]], str]
+):
     path = tmp_path / f"{made().name}.json"
     save_calibration(made(), path)
     save_calibration(made(20 * DAY), tmp_path / "before.json")
@@ -166,7 +164,7 @@ def test_an_older_copy_does_not_stand_in_for_the_cells_own_file_that_cannot_be_r
 
 
 @pytest.mark.parametrize("ending", ["-old", " (copy)", "_old"])
-def test_a_copy_does_not_hide_what_the_cells_own_file_was_given_since(tmp_path: Path, ending: str) -> None:
+def test_a_copy_does_not_hide_what_the_cells_own_file_was_given_since(tmp_path, ending: str):
     own = made()
     save_calibration(own, tmp_path / f"{own.name}{ending}.json")
     own = replace(own, scan=replace(own.scan, refused="its shutter rolls"))

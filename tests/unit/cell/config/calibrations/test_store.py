@@ -44,13 +44,13 @@ def made(age: float = DAY, devices: dict[str, str] = DEVICES, configuration: str
     return CellCalibration(scan, target, dict(devices), configuration, time.time() - age)
 
 
-def test_its_hash_tells_two_calibrations_apart() -> None:
+def test_its_hash_tells_two_calibrations_apart():
     one = made()
     other = replace(one, target=replace(one.target, hand_eye_covariance=2.0 * np.eye(6)))
     assert one.hash() == replace(one).hash() != other.hash()
 
 
-def test_a_kept_pose_that_is_mirrored_sheared_or_scaled_is_none() -> None:
+def test_a_kept_pose_that_is_mirrored_sheared_or_scaled_is_none():
     assert _pose(pin.SE3.Random().homogeneous, "view 1")
     for wrong in (np.diag([1.0, 1.0, -1.0, 1.0]), np.diag([1.001, 1.0, 1.0, 1.0]), np.eye(4) + np.eye(4, k=1) * 1e-3):
         with pytest.raises(ValueError, match="view 1 is no rotation and translation"):
@@ -78,8 +78,8 @@ def edited(path: Path, *keys: object, value: object) -> None:
     ],
 )
 def test_an_edit_is_refused_by_name_until_a_person_accepts_it(
-    tmp_path: Path, keys: tuple[object, ...], value: object, part: str
-) -> None:
+    tmp_path, keys: tuple[object, ...], value: object, part: str
+):
     path = tmp_path / "own.json"
     save_calibration(made(), path)
     edited(path, *keys, value=value)
@@ -96,7 +96,7 @@ def test_an_edit_is_refused_by_name_until_a_person_accepts_it(
         accept_calibration(path, "ann", "again")
 
 
-def test_one_without_its_digest_is_edited(tmp_path: Path) -> None:
+def test_one_without_its_digest_is_edited(tmp_path):
     path = tmp_path / "own.json"
     path.write_text(json.dumps(made().as_dict()), encoding="utf-8")
     with pytest.raises(CalibrationEdited, match="its digest, which is missing"):
@@ -130,9 +130,7 @@ ROWS[100:200] = 300.0
         (replace(made(), made=0.0), "no date"),
     ],
 )
-def test_figures_that_no_calibration_has_are_refused_whoever_wrote_them(
-    tmp_path: Path, spoilt: CellCalibration, says: str
-) -> None:
+def test_figures_that_no_calibration_has_are_refused_whoever_wrote_them(tmp_path, spoilt: CellCalibration, says: str):
     path = tmp_path / "own.json"
     save_calibration(replace(spoilt, edits=({"who": "a", "when": "b", "why": "c", "changed": []},)), path)
     with pytest.raises(CalibrationStale, match=says):
@@ -141,7 +139,7 @@ def test_figures_that_no_calibration_has_are_refused_whoever_wrote_them(
 
 @pytest.mark.parametrize("text", ["NaN", "Infinity", "1e999", "1e300", '"x"', "null", "[]"])
 @pytest.mark.parametrize("key", ["made", "covariance"])
-def test_a_figure_that_is_no_number_is_an_error_in_our_words(tmp_path: Path, text: str, key: str) -> None:
+def test_a_figure_that_is_no_number_is_an_error_in_our_words(tmp_path, text: str, key: str):
     path = tmp_path / "own.json"
     data = made().as_dict()
     (data if key == "made" else data["scan"])[key] = "HERE"
@@ -159,7 +157,7 @@ def test_a_figure_that_is_no_number_is_an_error_in_our_words(tmp_path: Path, tex
         (_scan(camera=replace(nominal_camera(CELL.scan_camera), fx=800.0)), "fx and fy over the drawn"),
     ],
 )
-def test_one_that_does_not_fit_the_drawing_is_not_used(spoilt: CellCalibration, says: str) -> None:
+def test_one_that_does_not_fit_the_drawing_is_not_used(spoilt: CellCalibration, says: str):
     scan, target = (camera.flange_from_camera.se3() for camera in (CELL.scan_camera, CELL.target_camera))
     spoilt = replace(spoilt, target=replace(spoilt.target, flange_from_camera=target))
     require_as_configured(replace(spoilt, scan=replace(made().scan, flange_from_camera=scan)), CELL)

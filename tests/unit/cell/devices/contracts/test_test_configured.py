@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -13,7 +12,7 @@ from tests.support.wire.cells import served
 pytestmark = pytest.mark.wire
 
 
-def test_every_built_in_make_keeps_the_contract_of_its_kind(tmp_path: Path) -> None:
+def test_every_built_in_make_keeps_the_contract_of_its_kind(tmp_path):
     """The target camera on the frame stream, the scan camera on GigE Vision where Aravis is installed."""
     gige = [] if make_of("camera", "gige").missing() else ["--gige", "scan"]
     with served(tmp_path, "--seed", "4", "--level", "ideal", *gige) as endpoints:
@@ -28,7 +27,7 @@ def test_every_built_in_make_keeps_the_contract_of_its_kind(tmp_path: Path) -> N
     assert "failed" not in done.stdout
 
 
-def test_without_a_configuration_no_device_is_touched(tmp_path: Path) -> None:
+def test_without_a_configuration_no_device_is_touched(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--pyargs",
          "cell.devices.contracts.test_configured"],

@@ -33,7 +33,7 @@ def watched(ppm: float = 0.0, late: float = 0.0, lost: int = 0, volts: float = 4
     return Watched((host + ways)[kept], (7000.0 + host * (1.0 + 1e-6 * ppm))[kept], volts, (30.0, hot, 30.0))
 
 
-def test_an_arm_that_is_well_has_nothing_outside() -> None:
+def test_an_arm_that_is_well_has_nothing_outside():
     found = arm_readings(watched(ppm=50.0), judge_times=True)
     assert outside(found) == []
     assert named(found, "state period by its clock, median") == pytest.approx(2.0, rel=1e-4)
@@ -52,13 +52,13 @@ def test_an_arm_that_is_well_has_nothing_outside() -> None:
         (watched(hot=90.0), "hottest joint"),
     ],
 )
-def test_each_trouble_of_an_arm_is_told_with_a_remedy(states: Watched, what: str) -> None:
+def test_each_trouble_of_an_arm_is_told_with_a_remedy(states: Watched, what: str):
     found = arm_readings(states, judge_times=True)
     assert what in outside(found)
     assert all(reading.remedy for reading in found if not reading.ok)
 
 
-def test_times_of_a_cell_in_a_hurry_are_shown_but_have_no_limit() -> None:
+def test_times_of_a_cell_in_a_hurry_are_shown_but_have_no_limit():
     found = arm_readings(watched(ppm=3000.0, late=0.030, lost=20), judge_times=False)
     assert outside(found) == []
     assert named(found, "states missing") == pytest.approx(100 * 20 / 499, rel=1e-6)
@@ -77,7 +77,7 @@ def vehicle(frames: list[tuple[float, can.Message]], interface: CanInterface | N
     return vehicle_readings(frames, 1.0, 500_000, load_database(), interface, judge_times=True)
 
 
-def test_a_vehicles_voltages_temperatures_and_bus_load_are_read() -> None:
+def test_a_vehicles_voltages_temperatures_and_bus_load_are_read():
     found = vehicle(heard())
     assert outside(found) == []
     assert (named(found, "battery"), named(found, "charge")) == (pytest.approx(25.8), 80)
@@ -87,7 +87,7 @@ def test_a_vehicles_voltages_temperatures_and_bus_load_are_read() -> None:
     assert named(found, "bus load, at most") == pytest.approx(100 * 53 * (108 + 24 + 3) / 500_000)
 
 
-def test_each_trouble_of_a_vehicle_and_its_bus_is_told() -> None:
+def test_each_trouble_of_a_vehicle_and_its_bus_is_told():
     error = [(0.1, can.Message(is_error_frame=True))]
     crowd = [(0.1, can.Message(arbitration_id=0x7, data=bytes(8), is_extended_id=False))] * 3000
     assert outside(vehicle(heard(period=0.1))) == ["feedback period, p99"]
@@ -100,13 +100,13 @@ def test_each_trouble_of_a_vehicle_and_its_bus_is_told() -> None:
     assert outside(vehicle(heard(), passive)) == ["error counter, sending"]
 
 
-def test_alarms_of_a_rails_module_are_told_and_its_open_load_and_standstill_are_none() -> None:
+def test_alarms_of_a_rails_module_are_told_and_its_open_load_and_standstill_are_none():
     assert outside(rail_readings(0b1110_0001)) == []
     assert outside(rail_readings(0b0000_0010)) == ["driver too hot"]
     assert outside(rail_readings(0b0001_0000)) == ["short circuit of the motor"]
 
 
-def test_frames_that_are_lost_late_or_badly_timed_are_told() -> None:
+def test_frames_that_are_lost_late_or_badly_timed_are_told():
     even = [0.1 * k for k in range(20)]
     found = stream_figures(even, 0, 0.0001, judged=True)
     assert outside(found) == []
@@ -118,6 +118,6 @@ def test_frames_that_are_lost_late_or_badly_timed_are_told() -> None:
     ]
 
 
-def test_a_figure_that_is_not_a_number_is_null_in_json() -> None:
+def test_a_figure_that_is_not_a_number_is_null_in_json():
     told = Diagnosis("arm", False, "", readings=[Reading("supply", math.nan, "V", 43.0, 53.0, "Measure it.")]).as_dict()
     assert (told["readings"][0]["value"], told["readings"][0]["ok"]) == (None, False)

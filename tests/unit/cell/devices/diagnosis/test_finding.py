@@ -46,13 +46,13 @@ def port(device: str, **told: str) -> ListPortInfo:
     return info
 
 
-def test_a_system_without_dev_sys_or_proc_has_nothing_and_says_so_without_an_error(tmp_path: Path) -> None:
+def test_a_system_without_dev_sys_or_proc_has_nothing_and_says_so_without_an_error(tmp_path):
     assert serial_ports(tmp_path, []) == []
     assert can_interfaces(tmp_path) == []
     assert cameras(tmp_path) == []
 
 
-def test_serial_ports_are_told_with_their_steady_name_and_what_they_look_like(tmp_path: Path) -> None:
+def test_serial_ports_are_told_with_their_steady_name_and_what_they_look_like(tmp_path):
     (tmp_path / "ttyACM0").touch()
     device = str(tmp_path / "ttyACM0")
     links = tmp_path / "dev/serial/by-id"
@@ -67,7 +67,7 @@ def test_serial_ports_are_told_with_their_steady_name_and_what_they_look_like(tm
     assert (plain.state, plain.write.count("usb-Trinamic")) == ("free", 2)
 
 
-def test_a_port_that_is_gone_or_in_use_is_told_with_the_next_step(tmp_path: Path) -> None:
+def test_a_port_that_is_gone_or_in_use_is_told_with_the_next_step(tmp_path):
     (gone,) = serial_ports(tmp_path, [port("/dev/ttyNONE9")])
     assert not gone.ok
     assert "plug it in" in gone.state
@@ -82,12 +82,12 @@ def test_a_port_that_is_gone_or_in_use_is_told_with_the_next_step(tmp_path: Path
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="nothing is forbidden to root")
-def test_a_port_without_permission_names_the_group_that_helps(tmp_path: Path) -> None:
+def test_a_port_without_permission_names_the_group_that_helps(tmp_path):
     (tmp_path / "ttyUSB0").touch(mode=0o000)
     assert "usermod -aG" in barred(str(tmp_path / "ttyUSB0"))
 
 
-def test_can_interfaces_are_those_of_the_kernels_type(tmp_path: Path) -> None:
+def test_can_interfaces_are_those_of_the_kernels_type(tmp_path):
     write(tmp_path, sys__class__net__can7__type="280", sys__class__net__can7__operstate="down")
     write(tmp_path, sys__class__net__eth0__type="1", sys__class__net__can8__operstate="up")
     (found,) = can_interfaces(tmp_path)
@@ -96,7 +96,7 @@ def test_can_interfaces_are_those_of_the_kernels_type(tmp_path: Path) -> None:
     assert found.write == '[vehicle] interface = "socketcan", channel = "can7"'
 
 
-def test_cameras_are_told_once_each(tmp_path: Path) -> None:
+def test_cameras_are_told_once_each(tmp_path):
     video, usb = "sys__class__video4linux", "sys__bus__usb__devices"
     write(tmp_path, **{f"{video}__video90__name": "HD Webcam", f"{video}__video90__index": "0"})
     write(tmp_path, **{f"{video}__video91__name": "HD Webcam", f"{video}__video91__index": "1"})
@@ -140,7 +140,7 @@ def listening(answer: Callable[[bytes], bytes]) -> Iterator[int]:
         thread.join(2.0)
 
 
-def test_a_gige_camera_is_asked_at_its_address_and_only_a_true_answer_counts() -> None:
+def test_a_gige_camera_is_asked_at_its_address_and_only_a_true_answer_counts():
     about = bytearray(248)
     about[104:109], about[216:220] = b"acA64", b"1234"
     asked: list[bytes] = []
@@ -158,14 +158,14 @@ def test_a_gige_camera_is_asked_at_its_address_and_only_a_true_answer_counts() -
     assert gige_camera("255.255.255.255") == ""
 
 
-def test_examples_are_not_asked_and_names_that_need_a_multicast_neither(tmp_path: Path) -> None:
+def test_examples_are_not_asked_and_names_that_need_a_multicast_neither(tmp_path):
     found = configured(config_with(tmp_path, '"192.0.2.10"', '"ur10.local"'), tmp_path)
     assert "multicast" in row(found, "configured arm").state
     assert "example" in row(found, "configured scan_camera").state
     assert not any(each.ok for each in found if each.where.startswith(("192.", "ur10", "/dev")))
 
 
-def test_an_arm_with_some_of_its_services_says_which_are_missing(tmp_path: Path) -> None:
+def test_an_arm_with_some_of_its_services_says_which_are_missing(tmp_path):
     config = config_with(tmp_path, '"192.0.2.10"', '"127.9.8.7"')
     with socket.create_server(("127.9.8.7", 29999)):
         arm = row(configured(config, tmp_path), "configured arm")
@@ -175,7 +175,7 @@ def test_an_arm_with_some_of_its_services_says_which_are_missing(tmp_path: Path)
     assert "Services on the teach pendant" in arm.state
 
 
-def test_a_device_that_a_run_holds_is_left_alone(tmp_path: Path) -> None:
+def test_a_device_that_a_run_holds_is_left_alone(tmp_path):
     config = config_with(tmp_path, '"/dev/ttyACM0"', '"socket://127.0.0.1:9"')
     with CellLock(config, ["rail"]):
         assert str(os.getpid()) in row(configured(config, tmp_path), "configured rail").state
@@ -183,7 +183,7 @@ def test_a_device_that_a_run_holds_is_left_alone(tmp_path: Path) -> None:
     assert who_holds("rail", "socket://127.0.0.1:9") == ""
 
 
-def test_a_module_is_asked_only_where_the_user_says_so(tmp_path: Path) -> None:
+def test_a_module_is_asked_only_where_the_user_says_so(tmp_path):
     with benched() as made:
         made.rail.close()
         found = ask_module(made.peer.url, None)
@@ -193,7 +193,7 @@ def test_a_module_is_asked_only_where_the_user_says_so(tmp_path: Path) -> None:
     assert not [each for each in find(None, root=tmp_path) if each.what == "TMCL module"]
 
 
-def test_a_broken_configuration_is_told_and_the_rest_is_still_listed(here: Path, typed: Typed) -> None:
+def test_a_broken_configuration_is_told_and_the_rest_is_still_listed(here: Path, typed: Typed):
     (here / "cell.toml").write_text("[cell\n", encoding="utf-8")
     rows = json.loads(typed("find", "/dev/ttyNONE9", "--json")[1])
     told = [each["what"] for each in rows if each["what"] in ("TMCL module", "configuration")]

@@ -20,7 +20,7 @@ def open_gate() -> Gate:
     return Gate(Interlocks(nothing, ()))
 
 
-def test_work_that_entered_before_a_stop_begins_nothing_after_it() -> None:
+def test_work_that_entered_before_a_stop_begins_nothing_after_it():
     gate, begun = open_gate(), []
     gate.enter(CancelToken())
     assert gate.begin(MOVE, lambda: 7, lambda: None) == 7
@@ -30,7 +30,7 @@ def test_work_that_entered_before_a_stop_begins_nothing_after_it() -> None:
     assert begun == []
 
 
-def test_who_listens_hears_what_passed_and_what_was_refused_with_why() -> None:
+def test_who_listens_hears_what_passed_and_what_was_refused_with_why():
     gate, heard = open_gate(), []
     gate.listener = SimpleNamespace(command=lambda command, refused: heard.append((command, refused)))
     gate.enter(CancelToken())
@@ -42,7 +42,7 @@ def test_who_listens_hears_what_passed_and_what_was_refused_with_why() -> None:
 
 
 @pytest.mark.parametrize("stopped", [True, False], ids=["stopped", "its run cancelled"])
-def test_a_stop_or_the_end_of_its_run_that_comes_while_something_begins_undoes_it(stopped: bool) -> None:
+def test_a_stop_or_the_end_of_its_run_that_comes_while_something_begins_undoes_it(stopped: bool):
     gate, undone, token = open_gate(), [], CancelToken()
     gate.enter(token)
     with pytest.raises(Aborted):
@@ -50,7 +50,7 @@ def test_a_stop_or_the_end_of_its_run_that_comes_while_something_begins_undoes_i
     assert undone == ["stopped"]
 
 
-def test_new_work_may_enter_and_an_abandoned_thread_stays_barred() -> None:
+def test_new_work_may_enter_and_an_abandoned_thread_stays_barred():
     gate = open_gate()
     entered, go_on, outcome = threading.Event(), threading.Event(), []
 
@@ -75,7 +75,7 @@ def test_new_work_may_enter_and_an_abandoned_thread_stays_barred() -> None:
     assert outcome == ["barred"]
 
 
-def test_a_thread_that_never_entered_is_barred_by_a_stop_until_a_person_clears_it_not_by_anothers_run() -> None:
+def test_a_thread_that_never_entered_is_barred_by_a_stop_until_a_person_clears_it_not_by_anothers_run():
     gate, said = open_gate(), []
 
     def script() -> None:
@@ -102,7 +102,7 @@ def test_a_thread_that_never_entered_is_barred_by_a_stop_until_a_person_clears_i
     ]  # fmt: skip
 
 
-def test_a_stop_that_comes_after_those_that_are_cleared_still_bars() -> None:
+def test_a_stop_that_comes_after_those_that_are_cleared_still_bars():
     """A run clears the stop at its own end; one that a person asks for at that moment is not cleared with it."""
     gate = open_gate()
     gate.shut()
@@ -118,7 +118,7 @@ def test_a_stop_that_comes_after_those_that_are_cleared_still_bars() -> None:
     gate.require(MOVE)
 
 
-def test_work_whose_run_is_to_end_begins_nothing_even_before_anything_was_stopped() -> None:
+def test_work_whose_run_is_to_end_begins_nothing_even_before_anything_was_stopped():
     gate, begun = open_gate(), []
     run = CancelToken()
     step = CancelToken(run)
@@ -130,7 +130,7 @@ def test_work_whose_run_is_to_end_begins_nothing_even_before_anything_was_stoppe
     assert begun == []
 
 
-def test_a_script_works_with_its_runs_token_in_any_thread_and_leaves_no_trace() -> None:
+def test_a_script_works_with_its_runs_token_in_any_thread_and_leaves_no_trace():
     gate, ended, run = open_gate(), CancelToken(), CancelToken()
     gate.enter(ended)
     ended.cancel("the step has ended")
@@ -144,7 +144,7 @@ def test_a_script_works_with_its_runs_token_in_any_thread_and_leaves_no_trace() 
         gate.require(MOVE)
 
 
-def test_a_stop_that_comes_while_the_rules_wait_lets_nothing_begin() -> None:
+def test_a_stop_that_comes_while_the_rules_wait_lets_nothing_begin():
     gate, begun, undone = open_gate(), [], []
     token = CancelToken()
     rule = Rule("slow", ("rail.move_to",), "", lambda now, command: token.cancel("enough") and None)

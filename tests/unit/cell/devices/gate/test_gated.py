@@ -25,7 +25,7 @@ def devices() -> Devices:
     return VirtualCell(CONFIG, seed=4, level="ideal").devices
 
 
-def test_who_listens_hears_what_laser_and_camera_are_asked_for() -> None:
+def test_who_listens_hears_what_laser_and_camera_are_asked_for():
     devices, heard = at_rest().devices, []
     devices.gate.listener = cast(Any, SimpleNamespace(command=lambda command, refused: heard.append(str(command))))
     devices.scan_camera.configure(0.002, 50.0)
@@ -38,7 +38,7 @@ def test_who_listens_hears_what_laser_and_camera_are_asked_for() -> None:
     assert heard == [*asked, "laser.lit", "laser.off"]
 
 
-def test_after_the_stop_nothing_begins_and_all_can_be_read_and_stopped(devices: Devices) -> None:
+def test_after_the_stop_nothing_begins_and_all_can_be_read_and_stopped(devices: Devices):
     arm, rail, vehicle = devices.arm, devices.rail, devices.vehicle
     devices.gate.enter(CancelToken())
     rail.home().wait(60.0)
@@ -73,7 +73,7 @@ def test_after_the_stop_nothing_begins_and_all_can_be_read_and_stopped(devices: 
     assert devices.stop() == devices.close() == []
 
 
-def test_after_a_stop_an_output_that_is_the_lasers_can_still_be_switched_off_and_no_other() -> None:
+def test_after_a_stop_an_output_that_is_the_lasers_can_still_be_switched_off_and_no_other():
     devices = VirtualCell(CONFIG, seed=4, level="ideal").devices
     arm, laser = devices.arm, CONFIG.laser.output
     devices.gate.enter(CancelToken())
@@ -86,7 +86,7 @@ def test_after_a_stop_an_output_that_is_the_lasers_can_still_be_switched_off_and
     assert [arm.state().digital_outputs >> output & 1 for output in (7, laser)] == [1, 0]
 
 
-def test_a_stop_that_comes_while_a_rule_of_the_claw_waits_leaves_the_part_held() -> None:
+def test_a_stop_that_comes_while_a_rule_of_the_claw_waits_leaves_the_part_held():
     """What a claw does cannot be undone without dropping the part, so it is looked again before it is told."""
 
     def waits(now: Situation, command: DeviceCommand) -> None:
@@ -100,7 +100,7 @@ def test_a_stop_that_comes_while_a_rule_of_the_claw_waits_leaves_the_part_held()
     assert devices.claw.holding
 
 
-def test_the_laser_goes_off_by_itself_when_its_owner_sleeps() -> None:
+def test_the_laser_goes_off_by_itself_when_its_owner_sleeps():
     world = at_rest()
     devices = world.devices
     with devices.interlocks.purpose("test"):
@@ -131,7 +131,7 @@ class Stubborn:
         self.bare.stop()
 
 
-def test_a_laser_that_does_not_go_off_is_switched_off_again() -> None:
+def test_a_laser_that_does_not_go_off_is_switched_off_again():
     world = at_rest()
     devices = world.devices
     failures = [DeadlineError("arm", "no answer"), RuntimeError("unforeseen")]

@@ -57,18 +57,18 @@ def shifted(devices: Devices, *by: float) -> np.ndarray:
     return to_ur(from_parts(by) * from_ur(devices.arm.state().flange))
 
 
-def test_the_table_in_the_documents_is_current() -> None:
+def test_the_table_in_the_documents_is_current():
     assert markdown() in DOCUMENT.read_text(encoding="utf-8")
 
 
-def test_every_rule_is_asked_for_commands_that_there_are(devices: Devices) -> None:
+def test_every_rule_is_asked_for_commands_that_there_are(devices: Devices):
     for rule in RULES:
         for command in rule.commands:
             device, name = command.split(".")
             assert hasattr(getattr(devices, device), name), command
 
 
-def test_the_arm_moves_only_while_the_vehicle_is_parked_and_braked(devices: Devices) -> None:
+def test_the_arm_moves_only_while_the_vehicle_is_parked_and_braked(devices: Devices):
     devices.vehicle.enable()
     stood = devices.arm.state().joints
     away = HOME + 0.1
@@ -82,7 +82,7 @@ def test_the_arm_moves_only_while_the_vehicle_is_parked_and_braked(devices: Devi
     devices.arm.move_joints(away, 0.5, 1.0).wait(30.0)
 
 
-def test_the_vehicle_drives_only_with_the_arm_at_rest_in_a_transport_pose(world: VirtualCell, devices: Devices) -> None:
+def test_the_vehicle_drives_only_with_the_arm_at_rest_in_a_transport_pose(world: VirtualCell, devices: Devices):
     devices.vehicle.enable()
     devices.vehicle.drive(0.1, 0.0)
     devices.vehicle.brake()
@@ -99,7 +99,7 @@ def test_the_vehicle_drives_only_with_the_arm_at_rest_in_a_transport_pose(world:
     devices.vehicle.brake()
 
 
-def test_the_laser_is_lit_for_a_declared_purpose_only_and_not_while_driving(devices: Devices) -> None:
+def test_the_laser_is_lit_for_a_declared_purpose_only_and_not_while_driving(devices: Devices):
     refused("laser_purpose", devices.laser.lit().__enter__, "sweep, calibration, test")
     assert not devices.laser.is_on
     with pytest.raises(ConfigError, match="sweep, calibration, test"), devices.interlocks.purpose("show"):
@@ -112,7 +112,7 @@ def test_the_laser_is_lit_for_a_declared_purpose_only_and_not_while_driving(devi
     assert not devices.laser.is_on
 
 
-def test_an_alarm_on_the_wall_rings_whatever_its_owner_does_and_not_after_its_end() -> None:
+def test_an_alarm_on_the_wall_rings_whatever_its_owner_does_and_not_after_its_end():
     clock, rung = Clock(rate=100.0), []
 
     def ring() -> float | None:
@@ -129,7 +129,7 @@ def test_an_alarm_on_the_wall_rings_whatever_its_owner_does_and_not_after_its_en
     assert len(rung) == 3
 
 
-def test_the_claw_opens_at_contact_or_when_it_is_empty(world: VirtualCell, devices: Devices) -> None:
+def test_the_claw_opens_at_contact_or_when_it_is_empty(world: VirtualCell, devices: Devices):
     refused("claw_at_contact", devices.claw.release, "the part would fall", "maintenance")
     assert devices.claw.holding
     devices.arm.move_joints(HOME + 0.02, 0.5, 1.0).wait(30.0)
@@ -153,7 +153,7 @@ def at_contact(world: VirtualCell, devices: Devices) -> None:
 
 def test_the_claw_opens_where_contact_ended_and_not_once_the_arm_was_moved_from_there(
     world: VirtualCell, devices: Devices
-) -> None:
+):
     at_contact(world, devices)
     devices.arm.bare.move_joints(devices.arm.state().joints + 0.02, 0.5, 1.0).wait(30.0)
     refused("claw_at_contact", devices.claw.release, "1.15 deg since its motion ended at contact", "0.29 deg")
@@ -163,7 +163,7 @@ def test_the_claw_opens_where_contact_ended_and_not_once_the_arm_was_moved_from_
     assert not devices.claw.holding
 
 
-def test_a_retreat_that_failed_as_it_began_leaves_no_contact_behind(world: VirtualCell, devices: Devices) -> None:
+def test_a_retreat_that_failed_as_it_began_leaves_no_contact_behind(world: VirtualCell, devices: Devices):
     at_contact(world, devices)
     bare = devices.arm.bare
 
@@ -184,7 +184,7 @@ def test_a_retreat_that_failed_as_it_began_leaves_no_contact_behind(world: Virtu
     assert devices.claw.holding
 
 
-def test_the_way_of_a_path_is_known_while_the_arm_follows_it_and_of_no_other_motion(devices: Devices) -> None:
+def test_the_way_of_a_path_is_known_while_the_arm_follows_it_and_of_no_other_motion(devices: Devices):
     stood, situation = devices.arm.state().joints, devices.interlocks.situation
     way = np.array([stood, stood + 0.001])
     devices.arm.follow(np.array([0.0, 1.0]), way).wait(30.0)
@@ -193,13 +193,13 @@ def test_the_way_of_a_path_is_known_while_the_arm_follows_it_and_of_no_other_mot
     assert situation.way is None
 
 
-def test_a_recovery_leaves_no_contact_behind(world: VirtualCell, devices: Devices) -> None:
+def test_a_recovery_leaves_no_contact_behind(world: VirtualCell, devices: Devices):
     at_contact(world, devices)
     devices.arm.recover()
     refused("claw_at_contact", devices.claw.release)
 
 
-def test_the_brake_opens_only_with_the_arm_at_rest_and_free(world: VirtualCell, devices: Devices) -> None:
+def test_the_brake_opens_only_with_the_arm_at_rest_and_free(world: VirtualCell, devices: Devices):
     motion = devices.arm.move_joints(HOME + 0.3, 0.5, 1.0)
     world.clock.sleep(0.2)
     refused("arm_still", devices.vehicle.enable, "the arm moves")
@@ -211,7 +211,7 @@ def test_the_brake_opens_only_with_the_arm_at_rest_and_free(world: VirtualCell, 
     devices.vehicle.enable()
 
 
-def test_two_commands_that_exclude_each_other_do_not_both_pass(devices: Devices) -> None:
+def test_two_commands_that_exclude_each_other_do_not_both_pass(devices: Devices):
     """While one is being begun the other one waits, and is checked against what the first one made."""
     gate, order = devices.gate, []
     inside, go_on = threading.Event(), threading.Event()
@@ -232,7 +232,7 @@ def test_two_commands_that_exclude_each_other_do_not_both_pass(devices: Devices)
     assert order == ["first begun", "second begun"]
 
 
-def test_a_stop_does_not_wait_for_what_is_being_begun(devices: Devices) -> None:
+def test_a_stop_does_not_wait_for_what_is_being_begun(devices: Devices):
     inside, go_on, undone = threading.Event(), threading.Event(), threading.Event()
 
     def slowly() -> None:
@@ -249,7 +249,7 @@ def test_a_stop_does_not_wait_for_what_is_being_begun(devices: Devices) -> None:
     assert undone.is_set()
 
 
-def test_a_drive_that_is_refused_ends_the_velocity_before_it(world: VirtualCell, devices: Devices) -> None:
+def test_a_drive_that_is_refused_ends_the_velocity_before_it(world: VirtualCell, devices: Devices):
     devices.vehicle.enable()
     devices.vehicle.drive(0.1, 0.0)
     world.clock.sleep(0.1)
@@ -264,7 +264,7 @@ def test_a_drive_that_is_refused_ends_the_velocity_before_it(world: VirtualCell,
 @pytest.mark.parametrize(
     "joints", [np.full(6, np.nan), np.full(6, 1e6), np.zeros(5), ["a"] * 6], ids=["nan", "far", "five", "words"]
 )
-def test_what_no_arm_can_be_asked_is_a_limit_before_anything_is_reckoned(devices: Devices, joints: object) -> None:
+def test_what_no_arm_can_be_asked_is_a_limit_before_anything_is_reckoned(devices: Devices, joints: object):
     arm, here = devices.arm, devices.arm.state().joints
     for begin in (
         lambda: arm.move_joints(joints, 0.5, 1.0),
@@ -277,7 +277,7 @@ def test_what_no_arm_can_be_asked_is_a_limit_before_anything_is_reckoned(devices
     assert np.array_equal(arm.state().joints, here)
 
 
-def test_what_rests_on_a_calibration_is_refused_without_one_that_fits(devices: Devices) -> None:
+def test_what_rests_on_a_calibration_is_refused_without_one_that_fits(devices: Devices):
     devices.rail.move_to(devices.rail.sweep_start(0.02, 0.03, 0.015)).wait(30.0)
     here = devices.arm.state().joints
 
@@ -296,7 +296,7 @@ def test_what_rests_on_a_calibration_is_refused_without_one_that_fits(devices: D
     devices.arm.follow(np.array([0.0, 1.0]), np.array([here, here])).wait(30.0)
 
 
-def test_a_raw_move_into_the_cells_own_bodies_is_refused(world: VirtualCell, devices: Devices) -> None:
+def test_a_raw_move_into_the_cells_own_bodies_is_refused(world: VirtualCell, devices: Devices):
     stood = devices.arm.state()
     onto_the_deck = shifted(devices, -0.6, 0.2, -0.6)
     into_itself = HOME + np.array([0.0, 0.0, 1.55, 0.0, 0.0, 0.0])
@@ -308,7 +308,7 @@ def test_a_raw_move_into_the_cells_own_bodies_is_refused(world: VirtualCell, dev
 
 
 @pytest.mark.parametrize("turn", [0.3, 0.0])
-def test_a_straight_line_is_checked_all_the_way_in_even_steps_as_it_turns(turn: float) -> None:
+def test_a_straight_line_is_checked_all_the_way_in_even_steps_as_it_turns(turn: float):
     """Its poses lie on the line and turn evenly about one axis, no farther apart than a collision check may skip."""
     ways, shift = Ways(CONFIG), np.array([0.0, -0.03, 0.08])
     begin = ways.forward(HOME)
@@ -322,7 +322,7 @@ def test_a_straight_line_is_checked_all_the_way_in_even_steps_as_it_turns(turn: 
         np.testing.assert_allclose(pin.log3(pose.rotation @ begin.rotation.T), [0.0, turn * share, 0.0], atol=1e-5)
 
 
-def test_raw_moves_are_checked_against_the_station_until_the_vehicle_may_drive(devices: Devices) -> None:
+def test_raw_moves_are_checked_against_the_station_until_the_vehicle_may_drive(devices: Devices):
     stood = devices.arm.state().joints
     down = shifted(devices, 0.0, 0.0, -0.05)
     tip = from_ur(devices.arm.state().flange) * from_parts((0.0, 0.0, 0.145))
@@ -338,9 +338,7 @@ def test_raw_moves_are_checked_against_the_station_until_the_vehicle_may_drive(d
     devices.arm.move_linear(down, 0.05, 0.5).wait(30.0)
 
 
-def test_a_vehicle_that_could_not_be_enabled_still_stands_before_the_station(
-    world: VirtualCell, devices: Devices
-) -> None:
+def test_a_vehicle_that_could_not_be_enabled_still_stands_before_the_station(world: VirtualCell, devices: Devices):
     tip = from_ur(devices.arm.state().flange) * from_parts((0.0, 0.0, 0.145))
     table = block("table", BASE, tip.translation - [0.3, 0.3, 0.2], tip.translation + np.array([0.3, 0.3, -0.03]))
     devices.interlocks.stand_before([table])
@@ -352,7 +350,7 @@ def test_a_vehicle_that_could_not_be_enabled_still_stands_before_the_station(
     refused("way_clear", lambda: devices.arm.move_linear(down, 0.05, 0.5), "claw and table")
 
 
-def test_the_part_counts_only_while_the_claw_holds_it(devices: Devices) -> None:
+def test_the_part_counts_only_while_the_claw_holds_it(devices: Devices):
     arm, interlocks = devices.arm, devices.interlocks
     post = from_ur(arm.state().flange) * from_parts((0.0, 0.0, 0.2))
     interlocks.stand_before([block("post", BASE, post.translation - 0.02, post.translation + 0.02)])
@@ -364,7 +362,7 @@ def test_the_part_counts_only_while_the_claw_holds_it(devices: Devices) -> None:
     assert interlocks.situation.part == ()
 
 
-def test_what_is_near_at_the_beginning_may_part_but_not_come_nearer(devices: Devices) -> None:
+def test_what_is_near_at_the_beginning_may_part_but_not_come_nearer(devices: Devices):
     arm = devices.arm
     tip = (from_ur(arm.state().flange) * from_parts((0.0, 0.0, 0.145))).translation
     devices.interlocks.stand_before([block("shelf", BASE, tip - [0.3, 0.3, 0.1], tip + np.array([0.3, 0.3, -0.001]))])
@@ -383,7 +381,7 @@ def test_what_is_near_at_the_beginning_may_part_but_not_come_nearer(devices: Dev
 @pytest.mark.parametrize(("row", "column", "by"), [(1, 0, 0.06e-3), (4, 3, 0.2e-3)], ids=["length", "zero"])
 def test_an_arm_that_was_calibrated_anew_under_the_cell_does_not_move(
     world: VirtualCell, devices: Devices, row: int, column: int, by: float
-) -> None:
+):
     devices.arm.move_joints(HOME + 0.01, 0.5, 1.0).wait(60.0)
     before = devices.arm.state()
     table = world.world.arm.params.dh.copy()
@@ -398,9 +396,7 @@ def test_an_arm_that_was_calibrated_anew_under_the_cell_does_not_move(
     assert np.array_equal(devices.arm.state().joints, before.joints)
 
 
-def test_an_arm_without_power_is_refused_by_its_driver_which_says_how_it_goes_on(
-    world: VirtualCell, devices: Devices
-) -> None:
+def test_an_arm_without_power_is_refused_by_its_driver_which_says_how_it_goes_on(world: VirtualCell, devices: Devices):
     arm = world.world.arm
     table = arm.params.dh.copy()
     table[1, 0] += 1e-3

@@ -73,7 +73,7 @@ def rules(vehicle: VehicleState = STANDS, arm: ArmState | None = None, **known: 
     return Interlocks(situation, RULES)
 
 
-def test_what_is_written_down_here_lets_arm_and_vehicle_move() -> None:
+def test_what_is_written_down_here_lets_arm_and_vehicle_move():
     rules().require(MOVE)
     rules().require(DRIVE)
 
@@ -82,20 +82,20 @@ def test_what_is_written_down_here_lets_arm_and_vehicle_move() -> None:
     "moving", [{"speed": 0.006}, {"speed": -0.006}, {"yaw_rate": 0.006}, {"yaw_rate": -0.006},
                {"speed": math.nan}, {"yaw_rate": math.nan}], ids=str
 )  # fmt: skip
-def test_a_vehicle_that_rolls_or_turns_either_way_is_not_parked(moving: dict[str, float]) -> None:
+def test_a_vehicle_that_rolls_or_turns_either_way_is_not_parked(moving: dict[str, float]):
     with pytest.raises(InterlockError, match=r"vehicle drives at .*vehicle_parked"):
         rules(replace(STANDS, **moving)).require(MOVE)
 
 
 @pytest.mark.parametrize("braked", [False, None])
-def test_a_brake_that_is_open_or_not_known_is_not_locked(braked: bool | None) -> None:
+def test_a_brake_that_is_open_or_not_known_is_not_locked(braked: bool | None):
     with pytest.raises(InterlockError, match="vehicle_parked"):
         rules(replace(STANDS, braked=braked)).require(MOVE)
 
 
 @pytest.mark.parametrize("joint", range(6))
 @pytest.mark.parametrize("speed", [0.06, -0.06, math.nan])
-def test_an_arm_that_turns_any_joint_either_way_is_not_stowed(joint: int, speed: float) -> None:
+def test_an_arm_that_turns_any_joint_either_way_is_not_stowed(joint: int, speed: float):
     turning = arm_state(joint_speeds=np.where(np.arange(6) == joint, speed, 0.0))
     with pytest.raises(InterlockError, match=r"the arm moves.*arm_stowed"):
         rules(arm=turning).require(DRIVE)
@@ -103,7 +103,7 @@ def test_an_arm_that_turns_any_joint_either_way_is_not_stowed(joint: int, speed:
         rules(arm=turning).require(DeviceCommand("vehicle", "enable"))
 
 
-def test_an_arm_whose_motion_is_not_over_is_not_stowed_though_it_stands() -> None:
+def test_an_arm_whose_motion_is_not_over_is_not_stowed_though_it_stands():
     with pytest.raises(InterlockError, match=r"the arm moves.*arm_stowed"):
         rules(last=Ended(False)).require(DRIVE)
     rules(last=Ended(True)).require(DRIVE)
@@ -111,7 +111,7 @@ def test_an_arm_whose_motion_is_not_over_is_not_stowed_though_it_stands() -> Non
 
 @pytest.mark.parametrize("joint", range(6))
 @pytest.mark.parametrize("off", [math.radians(2.1), -math.radians(2.1)])
-def test_one_joint_off_is_another_posture(joint: int, off: float) -> None:
+def test_one_joint_off_is_another_posture(joint: int, off: float):
     with pytest.raises(InterlockError, match=r"2\.1 deg from HOME.*arm_stowed"):
         rules(arm=arm_state(joints=off * np.eye(6)[joint])).require(DRIVE)
 
@@ -120,7 +120,7 @@ def test_one_joint_off_is_another_posture(joint: int, off: float) -> None:
     ("shift", "turn", "fits"),
     [(0.9 * LOOK_M, 0.0, True), (0.0, 0.9 * LOOK_RAD, True), (1.1 * LOOK_M, 0.0, False), (0.0, 1.1 * LOOK_RAD, False)],
 )
-def test_a_looking_pose_is_one_by_its_place_and_by_its_turn(shift: float, turn: float, fits: bool) -> None:
+def test_a_looking_pose_is_one_by_its_place_and_by_its_turn(shift: float, turn: float, fits: bool):
     look = LOOK * pin.SE3(pin.exp3(np.array([0.0, turn, 0.0])), np.array([0.0, 0.0, -shift]))
     interlocks = rules(arm=arm_state(joints=POSTURE + 1.0), looks={"the job's": look})
     with nullcontext() if fits else pytest.raises(InterlockError, match="arm_stowed"):
@@ -131,7 +131,7 @@ def test_a_looking_pose_is_one_by_its_place_and_by_its_turn(shift: float, turn: 
     ("shift", "turn", "same"),
     [(0.04e-3, 0.0, True), (0.0, 0.09e-3, True), (-0.06e-3, 0.0, False), (0.0, -0.11e-3, False)],
 )
-def test_the_flange_is_compared_in_place_and_in_turn(shift: float, turn: float, same: bool) -> None:
+def test_the_flange_is_compared_in_place_and_in_turn(shift: float, turn: float, same: bool):
     told = LOOK * pin.SE3(pin.exp3(np.array([0.0, 0.0, turn])), np.array([0.0, shift, 0.0]))
     with nullcontext() if same else pytest.raises(InterlockError, match="same_kinematics"):
         rules(arm=arm_state(flange=to_ur(told))).require(MOVE)
@@ -162,14 +162,14 @@ class Late(Told):
 )  # fmt: skip
 def test_a_late_reading_is_waited_for_and_an_old_one_is_enough_of_a_vehicle_that_is_braked_and_not_silent(
     vehicle: Late, error: type[Exception] | None
-) -> None:
+):
     with nullcontext() if error is None else pytest.raises(error):
         interlocks = rules()
         interlocks.situation.vehicle = vehicle  # type: ignore[assignment]
         interlocks.require(MOVE)
 
 
-def test_driving_is_judged_by_the_arms_newest_state_without_waiting_for_another() -> None:
+def test_driving_is_judged_by_the_arms_newest_state_without_waiting_for_another():
     """The arm is shaken a little as the vehicle drives; the laser's output shows in the same state."""
     shaken = arm_state(joint_speeds=np.full(6, 0.02), moving=True)
     interlocks = rules(arm=shaken, laser=Told("laser", None), outputs={0: "laser"})
@@ -181,7 +181,7 @@ def test_driving_is_judged_by_the_arms_newest_state_without_waiting_for_another(
         interlocks.require(DRIVE)
 
 
-def test_nothing_drives_by_an_old_state_of_the_arm() -> None:
+def test_nothing_drives_by_an_old_state_of_the_arm():
     old = arm_state(stamp=Clock().now() - LATE_S - 0.1)
     with pytest.raises(DeadlineError, match="newest state is"):
         rules(arm=old).require(DRIVE)
@@ -192,7 +192,7 @@ def test_nothing_drives_by_an_old_state_of_the_arm() -> None:
     ("index", "value", "refused"),
     [(0, True, True), (0, False, False), (1, True, True), (1, False, True), (2, True, False), (2, False, False)],
 )
-def test_of_the_outputs_of_others_the_lasers_alone_may_be_switched_off(index: int, value: bool, refused: bool) -> None:
+def test_of_the_outputs_of_others_the_lasers_alone_may_be_switched_off(index: int, value: bool, refused: bool):
     interlocks = rules(outputs={0: "laser", 1: "claw"})
     command = DeviceCommand("arm", "set_digital_output", {"index": index, "value": value})
     own = pytest.raises(InterlockError, match=rf"output {index} is the .*'s\. Use the .*own_switch")
@@ -200,7 +200,7 @@ def test_of_the_outputs_of_others_the_lasers_alone_may_be_switched_off(index: in
         interlocks.require(command)
 
 
-def test_a_rule_is_lifted_inside_its_context_only() -> None:
+def test_a_rule_is_lifted_inside_its_context_only():
     interlocks = rules(replace(STANDS, speed=0.1))
     with interlocks.lifted(["vehicle_parked"]):
         interlocks.require(MOVE)
@@ -214,7 +214,7 @@ def test_a_rule_is_lifted_inside_its_context_only() -> None:
 @pytest.mark.parametrize(
     ("holding", "held"), [(None, True), (True, True), (False, False)], ids=["none", "part", "empty"]
 )
-def test_the_part_is_in_the_way_unless_the_claws_switch_shows_none(holding: bool | None, held: bool) -> None:
+def test_the_part_is_in_the_way_unless_the_claws_switch_shows_none(holding: bool | None, held: bool):
     """Without a claw nothing tells: what a run has said is believed."""
     about: list[Any] = []
     claw = None if holding is None else Told("claw", None)
@@ -226,7 +226,7 @@ def test_the_part_is_in_the_way_unless_the_claws_switch_shows_none(holding: bool
     assert about == ["part", "station"] if held else about == ["station"]
 
 
-def test_a_contact_at_which_nobody_saw_the_arm_stand_opens_no_claw() -> None:
+def test_a_contact_at_which_nobody_saw_the_arm_stand_opens_no_claw():
     claw = Told("claw", None)
     claw.holding = True
     ended = Ended(True)
@@ -244,13 +244,13 @@ def test_a_contact_at_which_nobody_saw_the_arm_stand_opens_no_claw() -> None:
     np.testing.assert_array_equal(guarded.rest, POSTURE)
 
 
-def test_a_motion_that_felt_nothing_ends_nowhere_at_contact() -> None:
+def test_a_motion_that_felt_nothing_ends_nowhere_at_contact():
     free = GuardedMotion(Ended(True), Told("arm", arm_state()))  # type: ignore[arg-type]
     free.wait(1.0)
     assert (free.contact, free.rest) == (False, None)
 
 
-def test_what_the_laser_is_lit_for_holds_inside_its_context_only() -> None:
+def test_what_the_laser_is_lit_for_holds_inside_its_context_only():
     interlocks = rules()
     light = DeviceCommand("laser", "lit")
     with interlocks.purpose("sweep"), ThreadPoolExecutor(1) as other:
@@ -263,7 +263,7 @@ def test_what_the_laser_is_lit_for_holds_inside_its_context_only() -> None:
         interlocks.require(light)
 
 
-def test_an_output_is_tried_inside_its_context_only() -> None:
+def test_an_output_is_tried_inside_its_context_only():
     interlocks = rules(outputs={0: "laser", 1: "claw"})
     with interlocks.tried(2):
         with interlocks.tried(3):
@@ -272,7 +272,7 @@ def test_an_output_is_tried_inside_its_context_only() -> None:
     assert [interlocks.may_be_laser(output) for output in range(4)] == [True, False, False, False]
 
 
-def test_an_arm_that_can_hears_which_output_is_tried() -> None:
+def test_an_arm_that_can_hears_which_output_is_tried():
     """Should this process be killed, the server switches that output off."""
     heard: list[str] = []
 
@@ -290,7 +290,7 @@ def test_an_arm_that_can_hears_which_output_is_tried() -> None:
     assert heard == ["begin 2", "end 2"]
 
 
-def test_a_lit_laser_bars_driving_and_not_the_end_of_it() -> None:
+def test_a_lit_laser_bars_driving_and_not_the_end_of_it():
     lit = Told("laser", None)
     lit.is_on = True
     with pytest.raises(InterlockError, match="laser_off_to_drive"):

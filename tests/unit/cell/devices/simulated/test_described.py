@@ -62,7 +62,7 @@ def true(cell: VirtualCell, name: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("job", ["pot", "seat", "panel"])
-def test_what_ships_describes_the_stock_cell_to_the_last_bit(job: str) -> None:
+def test_what_ships_describes_the_stock_cell_to_the_last_bit(job: str):
     drawn = Described.of(job).drawing(load_config(None))
     size = (0.070, 0.060 if job == "panel" else 0.036, 0.020)
     stock = STOCK.with_surface(job)
@@ -70,7 +70,7 @@ def test_what_ships_describes_the_stock_cell_to_the_last_bit(job: str) -> None:
     assert drawn.as_json() == stock.as_json().replace("[0.07, 0.036, 0.02]", str(list(size)))
 
 
-def test_a_copy_of_a_shipped_mesh_is_known_by_what_is_in_it_not_by_its_name(tmp_path: Path) -> None:
+def test_a_copy_of_a_shipped_mesh_is_known_by_what_is_in_it_not_by_its_name(tmp_path):
     own = {"surface": {"mesh": '"mine.ply"'}}
     described(tmp_path, None, own)
     pot = load_job("pot")[1]
@@ -89,7 +89,7 @@ def test_a_copy_of_a_shipped_mesh_is_known_by_what_is_in_it_not_by_its_name(tmp_
 # --- every value arrives ---
 
 
-def test_the_carriage_goes_as_far_as_lead_steps_and_microsteps_say(tmp_path: Path) -> None:
+def test_the_carriage_goes_as_far_as_lead_steps_and_microsteps_say(tmp_path):
     rail = {"lead": '"5 mm"', "steps_per_turn": "400", "microsteps": "64", "travel": '["0 mm", "160 mm"]'}
     cell = ideal(tmp_path, {"rail": rail})
     cell.rail.home().wait(60.0)
@@ -100,7 +100,7 @@ def test_the_carriage_goes_as_far_as_lead_steps_and_microsteps_say(tmp_path: Pat
     assert not cell.rail.state().right_switch
 
 
-def test_cameras_hang_where_the_configuration_mounts_them(tmp_path: Path) -> None:
+def test_cameras_hang_where_the_configuration_mounts_them(tmp_path):
     scan, target = ((60.0, 70.0, 80.0), (3.0, -4.0, 20.0)), ((0.0, -100.0, 30.0), (0.0, 0.0, 180.0))
     config = {
         "scan_camera": {"flange_from_camera": pose(*scan)},
@@ -113,7 +113,7 @@ def test_cameras_hang_where_the_configuration_mounts_them(tmp_path: Path) -> Non
         assert found[:3, :3] == pytest.approx(about("z", z) @ about("y", y) @ about("x", x))
 
 
-def test_lens_sensor_and_light_plane_are_those_of_the_configuration(tmp_path: Path) -> None:
+def test_lens_sensor_and_light_plane_are_those_of_the_configuration(tmp_path):
     camera = {"focal_length": '"12 mm"', "pixel": '"3.45 um"', "width": "1024", "height": "768"}
     cell = ideal(tmp_path, {"scan_camera": camera, "laser": {"baseline": '"45 mm"', "tan_theta": "2.8"}})
     told = cell.truth()
@@ -127,7 +127,7 @@ def test_lens_sensor_and_light_plane_are_those_of_the_configuration(tmp_path: Pa
     assert picture.shape == (768, 1024)
 
 
-def test_a_described_filter_takes_its_share_of_the_laser_and_most_of_the_room(tmp_path: Path) -> None:
+def test_a_described_filter_takes_its_share_of_the_laser_and_most_of_the_room(tmp_path):
     band = {"filter": '{ centre = "660 nm", width = "20 nm", transmission = 0.5 }'}
     plain, filtered = ideal(tmp_path), ideal(tmp_path, {"scan_camera": band})
     assert filtered.world.scene.drawing.cell.scan.filter == pytest.approx((660e-9, 20e-9, 0.5))
@@ -137,7 +137,7 @@ def test_a_described_filter_takes_its_share_of_the_laser_and_most_of_the_room(tm
     assert dark[1] < 0.2 * dark[0]
 
 
-def test_station_vehicle_and_arm_stand_where_job_and_configuration_put_them(tmp_path: Path) -> None:
+def test_station_vehicle_and_arm_stand_where_job_and_configuration_put_them(tmp_path):
     job = {
         "approach": {
             name: pose((x, 40.0, -500.0), (0.0, 0.0, 2.0))
@@ -163,7 +163,7 @@ def test_station_vehicle_and_arm_stand_where_job_and_configuration_put_them(tmp_
     assert reach[0] == pytest.approx(-0.425 - 0.3922)
 
 
-def test_outputs_are_those_that_the_configuration_wires(tmp_path: Path) -> None:
+def test_outputs_are_those_that_the_configuration_wires(tmp_path):
     config = {"laser": {"output": "5"}, "claw": {"output": "4", "feedback": "3"}}
     cell = ideal(tmp_path, config)
     assert cell.devices.claw.holding
@@ -175,7 +175,7 @@ def test_outputs_are_those_that_the_configuration_wires(tmp_path: Path) -> None:
     assert not cell.truth()["part"]["held"]
 
 
-def test_deviations_are_drawn_about_what_is_described(tmp_path: Path) -> None:
+def test_deviations_are_drawn_about_what_is_described(tmp_path):
     """The same seed deviates by as much, whatever it deviates from."""
     drawn = drawing(tmp_path, {"rail": {"lead": '"5 mm"'}, "laser": {"baseline": '"45 mm"'}})
     stock, own = World(7, "nominal"), World(7, "nominal", drawing=drawn)
@@ -187,7 +187,7 @@ def test_deviations_are_drawn_about_what_is_described(tmp_path: Path) -> None:
 # --- a surface of one's own ---
 
 
-def test_the_ground_under_an_own_mesh_is_its_closed_form(tmp_path: Path) -> None:
+def test_the_ground_under_an_own_mesh_is_its_closed_form(tmp_path):
     write_saddle(tmp_path / "saddle.ply")
     ground = own_surface(str(tmp_path / "saddle.ply"), "mm").ground
     rng = np.random.default_rng(3)
@@ -202,7 +202,7 @@ def test_the_ground_under_an_own_mesh_is_its_closed_form(tmp_path: Path) -> None
     assert (beside == 0.0).all()
 
 
-def test_a_closed_solid_that_lies_beside_its_origin_is_felt_from_above(tmp_path: Path) -> None:
+def test_a_closed_solid_that_lies_beside_its_origin_is_felt_from_above(tmp_path):
     block = trimesh.creation.box((0.04, 0.03, 0.012))
     block.apply_translation([0.015, 0.004, 0.006])
     block.export(tmp_path / "block.stl")
@@ -213,7 +213,7 @@ def test_a_closed_solid_that_lies_beside_its_origin_is_felt_from_above(tmp_path:
 
 
 @pytest.mark.parametrize("lean", [(0.0, 0.0, 0.0), (0.0, 3.0, 25.0)])
-def test_a_part_set_down_on_an_own_surface_rests_where_it_belongs(tmp_path: Path, lean: Numbers) -> None:
+def test_a_part_set_down_on_an_own_surface_rests_where_it_belongs(tmp_path, lean: Numbers):
     write_saddle(tmp_path / "saddle.ply")
     job = {
         "surface": {
@@ -233,7 +233,7 @@ def test_a_part_set_down_on_an_own_surface_rests_where_it_belongs(tmp_path: Path
     assert np.abs(rest[:3, 3]).max() < (2e-5 if lean == (0.0, 0.0, 0.0) else 2e-4)
 
 
-def test_the_camera_sees_an_own_surface_where_it_stands(tmp_path: Path) -> None:
+def test_the_camera_sees_an_own_surface_where_it_stands(tmp_path):
     write_saddle(tmp_path / "saddle.ply")
     own = {"surface": {"mesh": '"saddle.ply"', "mesh_unit": '"mm"'}, "grasp": {"size": '["60 mm", "30 mm", "20 mm"]'}}
     world = World(1, "ideal", drawing=drawing(tmp_path, None, own))
@@ -249,7 +249,7 @@ def test_the_camera_sees_an_own_surface_where_it_stands(tmp_path: Path) -> None:
 # --- one world, one job after another ---
 
 
-def test_the_claw_is_filled_again_and_the_station_set_up_for_the_next_job(tmp_path: Path) -> None:
+def test_the_claw_is_filled_again_and_the_station_set_up_for_the_next_job(tmp_path):
     cell = ideal(tmp_path)
     first = Described.of(tmp_path / "own.toml")
     stood = true(cell, "world_from_vehicle")
@@ -279,7 +279,7 @@ def test_the_claw_is_filled_again_and_the_station_set_up_for_the_next_job(tmp_pa
     assert true(cell, "world_from_vehicle") == pytest.approx(stood)
 
 
-def test_each_part_lies_a_little_otherwise_in_the_claw_and_the_station_stays(tmp_path: Path) -> None:
+def test_each_part_lies_a_little_otherwise_in_the_claw_and_the_station_stays(tmp_path):
     world = World(5, "nominal")
     before = truth(world)["poses"]
     world.arm.write_digital_outputs(2, 0)
@@ -310,8 +310,8 @@ REFUSED: list[tuple[str, Changes, Changes, tuple[str, ...]]] = [
 
 @pytest.mark.parametrize(("config", "job", "says"), [row[1:] for row in REFUSED], ids=[row[0] for row in REFUSED])
 def test_what_cannot_be_simulated_as_described_is_refused_in_the_first_second(
-    tmp_path: Path, config: Changes, job: Changes, says: tuple[str, ...]
-) -> None:
+    tmp_path, config: Changes, job: Changes, says: tuple[str, ...]
+):
     cell, own = described(tmp_path, config, job)
     begun = time.process_time()
     with pytest.raises(ConfigError) as refused:
@@ -321,7 +321,7 @@ def test_what_cannot_be_simulated_as_described_is_refused_in_the_first_second(
         assert text in str(refused.value)
 
 
-def test_a_mesh_that_is_seen_from_below_is_refused(tmp_path: Path) -> None:
+def test_a_mesh_that_is_seen_from_below_is_refused(tmp_path):
     write_saddle(tmp_path / "saddle.ply")
     mesh = trimesh.load_mesh(tmp_path / "saddle.ply")
     mesh.invert()
@@ -331,7 +331,7 @@ def test_a_mesh_that_is_seen_from_below_is_refused(tmp_path: Path) -> None:
         drawing(tmp_path, None, job)
 
 
-def test_a_part_that_the_calibration_would_bring_to_the_deck_is_refused_before_anything_moves(tmp_path: Path) -> None:
+def test_a_part_that_the_calibration_would_bring_to_the_deck_is_refused_before_anything_moves(tmp_path):
     config = {
         "scan_camera": {"flange_from_camera": pose((60.0, 70.0, 80.0), (0.0, 0.0, 0.0))},
         "target_camera": {"flange_from_camera": pose((0.0, -100.0, 30.0), (0.0, 0.0, 180.0))},
@@ -342,7 +342,7 @@ def test_a_part_that_the_calibration_would_bring_to_the_deck_is_refused_before_a
         require_fit(job, load_config(cell), mesh, calibrates=True)
 
 
-def test_the_collision_bodies_of_the_cell_hang_where_the_cameras_are(tmp_path: Path) -> None:
+def test_the_collision_bodies_of_the_cell_hang_where_the_cameras_are(tmp_path):
     """A turned tool: what the planner keeps clear is where the world has cameras, laser and rail."""
     config: dict[str, dict[str, Any]] = {
         "scan_camera": {"flange_from_camera": pose((-50.0, -90.0, 80.0), (0.0, 5.0, 30.0))},

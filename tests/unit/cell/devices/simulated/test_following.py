@@ -46,7 +46,7 @@ MIXES = (
 )
 
 
-def test_pictures_follow_a_real_rail_and_there_are_none_while_nobody_knows_where_it_is(tmp_path: Path) -> None:
+def test_pictures_follow_a_real_rail_and_there_are_none_while_nobody_knows_where_it_is(tmp_path):
     clock = WorldClock()
     peer = TmclPeer(RailModel(RailParams(), np.random.default_rng(3)), clock)
     peer.start()
@@ -79,7 +79,7 @@ def test_pictures_follow_a_real_rail_and_there_are_none_while_nobody_knows_where
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory) -> Path:
     """Calibrations of mixes with the same devices are shared."""
     made = tmp_path_factory.mktemp("mixes")
     described(made, job=AIR)
@@ -88,19 +88,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("sim", MIXES)
-def test_the_job_ends_placed_with_any_mix_that_physics_allows(folder: Path, sim: str) -> None:
+def test_the_job_ends_placed_with_any_mix_that_physics_allows(folder: Path, sim: str):
     placed(folder, sim)
 
 
 @pytest.mark.campaign
-def test_the_job_ends_placed_when_a_real_arm_sweeps_a_simulated_scan_head(folder: Path) -> None:
+def test_the_job_ends_placed_when_a_real_arm_sweeps_a_simulated_scan_head(folder: Path):
     text = changed(job_path("pot").read_text(encoding="utf-8"), {"scan": {"mode": '"arm"'}})
     (folder / "arm.toml").write_text(text, encoding="utf-8")
     placed(folder, "scan_camera,laser", "arm.toml")
 
 
 @pytest.mark.campaign
-def test_the_job_ends_placed_when_the_simulated_scan_camera_is_on_gige_vision(tmp_path: Path) -> None:
+def test_the_job_ends_placed_when_the_simulated_scan_camera_is_on_gige_vision(tmp_path):
     require_aravis()
     described(tmp_path, {"scan_camera": {"driver": '"gige"', "address": '"192.0.2.20"'}}, AIR)
     placed(tmp_path, "scan_camera,laser")
@@ -132,7 +132,7 @@ def placed(folder: Path, sim: str, job: str = "pot") -> None:
 
 
 @pytest.mark.campaign
-def test_a_calibration_of_a_mix_is_none_of_the_real_cell_nor_of_a_simulated_one(folder: Path) -> None:
+def test_a_calibration_of_a_mix_is_none_of_the_real_cell_nor_of_a_simulated_one(folder: Path):
     with served(folder, "--seed", "11"):
         real = command("run", "-c", "sim.toml", folder=folder)
         mixed = command("run", "-c", "sim.toml", "--sim", "scan_camera,rail", "--seed", "4", folder=folder)

@@ -10,7 +10,7 @@ from sim_backends.faults import FAULT_NAMES
 from statemachine.step import Event
 
 
-def test_a_scheduled_fault_is_written_as_fault_step_and_share() -> None:
+def test_a_scheduled_fault_is_written_as_fault_step_and_share():
     assert Injection.parse("arm.protective_stop@laser_sweep:40%", PLACE.names) == Injection(
         "arm.protective_stop", "laser_sweep", 0.4
     )
@@ -19,7 +19,7 @@ def test_a_scheduled_fault_is_written_as_fault_step_and_share() -> None:
     )
 
 
-def test_every_fault_that_is_known_can_be_scheduled_and_written_back() -> None:
+def test_every_fault_that_is_known_can_be_scheduled_and_written_back():
     for name in FAULT_NAMES:
         assert str(Injection.parse(f"{name}@place:12.5%", PLACE.names)) == f"{name}@place:12.5%"
 
@@ -34,12 +34,12 @@ def test_every_fault_that_is_known_can_be_scheduled_and_written_back() -> None:
         ("arm.protective_stop@place:-1%", "write it as"),
     ],
 )
-def test_what_cannot_be_scheduled_is_refused_with_what_can(text: str, said: str) -> None:
+def test_what_cannot_be_scheduled_is_refused_with_what_can(text: str, said: str):
     with pytest.raises(ConfigError, match=said):
         Injection.parse(text, PLACE.names)
 
 
-def test_what_was_scheduled_and_did_not_happen_is_told_and_keeps_no_other_from_happening() -> None:
+def test_what_was_scheduled_and_did_not_happen_is_told_and_keeps_no_other_from_happening():
     caused: list[str] = []
 
     def cause(name: str) -> None:
@@ -57,7 +57,7 @@ def test_what_was_scheduled_and_did_not_happen_is_told_and_keeps_no_other_from_h
     assert injector.missed[texts[2]] == "the run did not come that far"
 
 
-def test_the_door_without_wires_has_every_fault_but_those_of_a_wire() -> None:
+def test_the_door_without_wires_has_every_fault_but_those_of_a_wire():
     assert set(direct.NAMES) | set(direct.ON_WIRES) == set(FAULT_NAMES)
     for name in direct.NAMES:
         direct.require(name)

@@ -41,13 +41,13 @@ GATES: dict[str, tuple[float, Gate]] = {
 
 
 @pytest.mark.parametrize(("good", "gate"), GATES.values(), ids=GATES)
-def test_a_figure_that_is_no_number_is_refused(good: float, gate: Gate) -> None:
+def test_a_figure_that_is_no_number_is_refused(good: float, gate: Gate):
     gate(good)
     with pytest.raises((RefusedError, DeviceFault)):
         gate(float("nan"))
 
 
-def test_a_wide_surface_is_as_whole_as_it_was_seen() -> None:
+def test_a_wide_surface_is_as_whole_as_it_was_seen():
     """As few points to its area as 10,000 are on 0.6 m by 0.3 m: one to a square of 4 mm."""
     corners = np.array([[0.0, 0.0, 0.0], [0.06, 0.0, 0.0], [0.06, 0.03, 0.0], [0.0, 0.03, 0.0]])
     plate, nothing = NominalSurface(corners, np.array([[0, 1, 2], [0, 2, 3]])), np.zeros((120, 3))

@@ -51,7 +51,7 @@ def asked(by: Callable[[Array], Array]) -> Dissent:
     return dissent(Scan.of(deformed_pot(by)), TRUE, nominal("pot"), TOLERANCE)
 
 
-def test_a_quarter_that_has_sunk_or_is_tilted_is_found_with_its_depth_and_its_angle() -> None:
+def test_a_quarter_that_has_sunk_or_is_tilted_is_found_with_its_depth_and_its_angle():
     sunk = asked(lambda x: -0.0004 * (x < EDGE))
     assert sunk.shift == pytest.approx(0.0004, abs=1e-4)
     assert sunk.middle[0] < -0.015 and sunk.excess > 0.5
@@ -62,14 +62,14 @@ def test_a_quarter_that_has_sunk_or_is_tilted_is_found_with_its_depth_and_its_an
 
 
 @pytest.mark.parametrize("axis", range(6))
-def test_a_motion_along_any_axis_counts_beyond_three_sigma(axis: int) -> None:
+def test_a_motion_along_any_axis_counts_beyond_three_sigma(axis: int):
     allowed = TOLERANCE.translation if axis < 3 else TOLERANCE.rotation
     motion, spread = np.zeros(6), np.zeros((6, 1))
     motion[axis], spread[axis] = 2.0 * allowed, 0.25 * allowed
     assert _beyond_noise(motion, spread, TOLERANCE) == pytest.approx(2.0 - 3 * 0.25)
 
 
-def test_how_much_of_the_area_lies_off_is_told_by_squares() -> None:
+def test_how_much_of_the_area_lies_off_is_told_by_squares():
     seen = Scan.of(deformed_pot(lambda x: 0.001 * (x < EDGE)))
     medians = _squares(seen, TRUE, nominal("pot"))
     raised = ((seen.points - TRUE.translation) @ TRUE.rotation)[:, 0] < EDGE
@@ -79,13 +79,13 @@ def test_how_much_of_the_area_lies_off_is_told_by_squares() -> None:
 
 
 @pytest.mark.parametrize("part", list(PARTS))
-def test_foreign_objects_and_missing_data_are_no_dissent(part: str) -> None:
+def test_foreign_objects_and_missing_data_are_no_dissent(part: str):
     seen = Scan.of(scan(PARTS[part], np.random.default_rng(8), Setting(clutter=0.2, missing=0.4)))
     pose = register(seen, nominal(part), Prior(TRUE, BOARD)).base_from_surface
     assert dissent(seen, pose, nominal(part), TOLERANCE).excess < 0.25
 
 
-def test_what_the_calibration_explains_is_no_dissent() -> None:
+def test_what_the_calibration_explains_is_no_dissent():
     plain = scan(PARTS["pot"], np.random.default_rng(3))
     along = plain.points[:, :, 0] - TRUE.translation[0]
     bow = 0.0002 * (along[..., None] / 0.035) ** 2 * TRUE.rotation[:, 2]
@@ -97,7 +97,7 @@ def test_what_the_calibration_explains_is_no_dissent() -> None:
 
 
 @pytest.mark.parametrize("worn", [0.1e-3, 0.2e-3])
-def test_a_wear_too_small_to_be_refused_is_stated_as_a_tilt_that_is_less_well_known(worn: float) -> None:
+def test_a_wear_too_small_to_be_refused_is_stated_as_a_tilt_that_is_less_well_known(worn: float):
     found = invert_pose(
         deformed_pot(lambda x: worn * np.maximum(x, 0) / 0.035), nominal("pot"), Prior(TRUE, BOARD), TOLERANCE
     )
@@ -107,7 +107,7 @@ def test_a_wear_too_small_to_be_refused_is_stated_as_a_tilt_that_is_less_well_kn
     assert tilt < 2.5 * found.sigma[4]
 
 
-def test_a_surface_worn_like_a_ramp_is_not_taken_for_a_tilted_one() -> None:
+def test_a_surface_worn_like_a_ramp_is_not_taken_for_a_tilted_one():
     for seed in (0, 12):
         judged = judge_case("worn 0.3 to 2 mm on one side", seed)
         assert judged.ended == "refused"
@@ -115,7 +115,7 @@ def test_a_surface_worn_like_a_ramp_is_not_taken_for_a_tilted_one() -> None:
 
 
 @pytest.mark.parametrize(("part", "seed"), [("seat", 1), ("seat", 30), ("pot", 6)])
-def test_starts_that_mislead_a_search_with_few_points_lead_to_the_true_pose(part: str, seed: int) -> None:
+def test_starts_that_mislead_a_search_with_few_points_lead_to_the_true_pose(part: str, seed: int):
     for outcome in task(part, seed):
         assert outcome.error[0] < 5e-5, outcome
         assert outcome.error[1] < 2e-3, outcome
@@ -138,7 +138,7 @@ def standing(record: JobRecord, cloud: Cloud, aside: float = 0.0) -> Standing | 
     return highest_standing(cloud, nominal, pose, from_parts((aside, 0.0, 0.0)), job.grasp.size)
 
 
-def test_nothing_stands_on_a_surface_that_is_as_drawn(placed_pot: JobRecord) -> None:
+def test_nothing_stands_on_a_surface_that_is_as_drawn(placed_pot: JobRecord):
     found = standing(placed_pot, placed_pot.results["reconstruct"].cloud)
     assert found is not None and found.height < 0.1e-3
     require_bare(found, pot()[0].place.tolerance)
@@ -149,7 +149,7 @@ def test_nothing_stands_on_a_surface_that_is_as_drawn(placed_pot: JobRecord) -> 
 )
 def test_a_chip_of_three_millimetres_is_seen_as_high_as_it_is(
     placed_pot: JobRecord, height: float, at: tuple[float, float]
-) -> None:
+):
     found = standing(placed_pot, with_chip(placed_pot, height, at=at))
     assert found is not None and found.height == pytest.approx(height, abs=0.12e-3)
     assert np.hypot(*(found.at[:2] - at)) < 1.5e-3
@@ -159,7 +159,7 @@ def test_a_chip_of_three_millimetres_is_seen_as_high_as_it_is(
     assert number.value > number.most == pytest.approx(0.3)
 
 
-def test_what_stands_higher_than_the_part_is_seen_too_and_a_place_that_was_not_seen_is_not_bare() -> None:
+def test_what_stands_higher_than_the_part_is_seen_too_and_a_place_that_was_not_seen_is_not_bare():
     job, cloud = pot()[0], scan(PARTS["pot"], np.random.default_rng(3))
     local = (cloud.points - TRUE.translation) @ TRUE.rotation
     on_bolt = np.abs(local[..., :2] - 0.004).max(axis=-1) < 0.005
@@ -173,7 +173,7 @@ def test_what_stands_higher_than_the_part_is_seen_too_and_a_place_that_was_not_s
         require_bare(aside, job.place.tolerance)
 
 
-def test_what_lies_beside_the_part_or_below_the_surface_does_not_lift_it(placed_pot: JobRecord) -> None:
+def test_what_lies_beside_the_part_or_below_the_surface_does_not_lift_it(placed_pot: JobRecord):
     beside = standing(placed_pot, with_chip(placed_pot, 1e-3), aside=-0.03)
     hollow = standing(placed_pot, with_chip(placed_pot, -1e-3))
     for found in (beside, hollow):
@@ -196,12 +196,12 @@ def placing(record: JobRecord, folder: Path, cloud: Cloud, notify: Callable[[Eve
     return str(refused.value)
 
 
-def test_the_job_ends_before_anything_moves(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_the_job_ends_before_anything_moves(placed_pot: JobRecord, tmp_path):
     told = placing(placed_pot, tmp_path, with_chip(placed_pot, 1e-3), lambda event: None)
     assert "Look what it is" in told and re.search(r"at \(1[123], [456], \d+\) mm", told)
 
 
-def test_a_place_of_which_little_was_scanned_is_told_of(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_a_place_of_which_little_was_scanned_is_told_of(placed_pot: JobRecord, tmp_path):
     def ended(event: Event) -> None:
         raise RefusedError(str(event.data["text"]))
 

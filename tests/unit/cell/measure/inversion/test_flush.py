@@ -49,7 +49,7 @@ def looked(
     )  # fmt: skip
 
 
-def test_a_part_that_stands_as_drawn_is_flush_within_its_noise() -> None:
+def test_a_part_that_stands_as_drawn_is_flush_within_its_noise():
     found = looked(swept(0.0))
     assert (np.abs(found.higher) < found.noise).all() and np.median(found.noise) < 0.15e-3
     assert found.beyond < 0.0
@@ -59,7 +59,7 @@ def test_a_part_that_stands_as_drawn_is_flush_within_its_noise() -> None:
     assert HALF - x.min() < BESIDE_M
 
 
-def test_each_piece_is_held_against_what_lies_beside_it() -> None:
+def test_each_piece_is_held_against_what_lies_beside_it():
     """The part is bent, 5 µm a mm along its edge; the surface is .1 mm lower beside it."""
     found = looked(swept(np.array([0.2e-3, 5e-3]), -0.1e-3))
     assert np.allclose(found.higher, 0.3e-3 + 5e-3 * found.places[:, 1], atol=0.05e-3)
@@ -72,14 +72,14 @@ def test_each_piece_is_held_against_what_lies_beside_it() -> None:
     assert re.fullmatch(r"\+0\.2\d to \+0\.[34]\d", found.span)
 
 
-def test_where_the_sweep_shows_both_moved_alike_nothing_is_seen_of_it() -> None:
+def test_where_the_sweep_shows_both_moved_alike_nothing_is_seen_of_it():
     """The arm's rest moves part and surface, so the surface is found beside its pose."""
     moved = TRUE * from_parts((0.1e-3, -0.2e-3, 0.3e-3))
     found = looked(swept(0.0), moved)
     assert np.abs(found.higher).max() < 0.06e-3
 
 
-def test_without_the_surface_beside_the_part_there_is_no_flush() -> None:
+def test_without_the_surface_beside_the_part_there_is_no_flush():
     cloud = swept(0.0)
     assert looked(cloud, TRUE * from_parts((0.0, 0.0, 0.05))) is None
     assert looked(cloud, surface=plate(0.25 * HALF)) is None, "nothing of the surface shows"
@@ -87,7 +87,7 @@ def test_without_the_surface_beside_the_part_there_is_no_flush() -> None:
 
 
 @pytest.mark.parametrize("thick", [1e-3, 2.8e-3])
-def test_a_thin_part_is_not_held_against_itself(thick: float) -> None:
+def test_a_thin_part_is_not_held_against_itself(thick: float):
     found = looked(swept(0.0, thick=thick), belongs=from_parts((0.0, 0.0, thick)))
     assert np.abs(found.higher).max() < 0.06e-3 and found.seen == 1.0
 
@@ -102,7 +102,7 @@ def with_local(cloud: Cloud, local: Array) -> Cloud:
 
 
 @pytest.mark.parametrize("lifted", [0.8e-3, 3.2e-3])
-def test_a_corner_that_is_bent_far_up_is_seen(lifted: float) -> None:
+def test_a_corner_that_is_bent_far_up_is_seen(lifted: float):
     cloud = swept(0.0)
     local = in_surface(cloud)
     corner = (local[..., 0] > 0.014) & (local[..., 0] < HALF) & (local[..., 1] > 0.008)
@@ -111,7 +111,7 @@ def test_a_corner_that_is_bent_far_up_is_seen(lifted: float) -> None:
     assert found.beyond == pytest.approx(1e3 * lifted, abs=0.15)
 
 
-def test_a_part_moved_to_the_side_is_no_higher_on_its_slopes() -> None:
+def test_a_part_moved_to_the_side_is_no_higher_on_its_slopes():
     """A roof of 45 deg, .5 mm aside and .2 mm up, tilted about x: as a rigid body it is that much higher."""
     turn = pin.rpy.rpyToMatrix(0.0, -np.pi / 4, 0.0)
     flat = plate(HALF * np.sqrt(2.0))
@@ -128,7 +128,7 @@ def test_a_part_moved_to_the_side_is_no_higher_on_its_slopes() -> None:
     assert np.allclose(found.higher, 0.2e-3 + 2e-3 * found.places[:, 1], atol=0.06e-3)
 
 
-def test_a_part_that_belongs_tilted_is_as_high_along_the_surface_s_z_axis() -> None:
+def test_a_part_that_belongs_tilted_is_as_high_along_the_surface_s_z_axis():
     tilt = pin.rpy.rpyToMatrix(0.0, -0.4, 0.0)
     belongs = pin.SE3(tilt, np.array([0.0, 0.0, THICK]))
 
@@ -139,7 +139,7 @@ def test_a_part_that_belongs_tilted_is_as_high_along_the_surface_s_z_axis() -> N
     assert np.median(found.higher) == pytest.approx(0.4e-3, abs=0.01e-3)
 
 
-def test_what_is_noisier_than_half_the_tolerance_says_nothing() -> None:
+def test_what_is_noisier_than_half_the_tolerance_says_nothing():
     found = looked(swept(0.0))
     middle = float(np.median(found.noise))
     fewer = looked(swept(0.0), tolerance=2.0 * middle)
@@ -148,12 +148,12 @@ def test_what_is_noisier_than_half_the_tolerance_says_nothing() -> None:
     assert looked(swept(0.0), tolerance=1e-6) is None
 
 
-def test_a_vehicle_that_rocks_may_have_a_piece_up_and_what_is_beside_it_down() -> None:
+def test_a_vehicle_that_rocks_may_have_a_piece_up_and_what_is_beside_it_down():
     still, rocked = looked(swept(0.0)), looked(swept(0.0), rocks=0.05e-3)
     assert rocked.noise.min() == pytest.approx(still.noise.min() + 0.1e-3)
 
 
-def test_a_piece_whose_points_disagree_says_nothing() -> None:
+def test_a_piece_whose_points_disagree_says_nothing():
     cloud = swept(0.0)
     local = in_surface(cloud)
     torn = (local[..., 0] > 0.012) & (np.abs(local[..., 0]) < HALF) & (np.abs(local[..., 1]) < 0.005)
@@ -163,7 +163,7 @@ def test_a_piece_whose_points_disagree_says_nothing() -> None:
     assert not ((found.places[:, 0] > 0.013) & (np.abs(found.places[:, 1]) < 0.004)).any()
 
 
-def test_the_side_of_a_part_below_its_sloped_top_is_no_piece_of_that() -> None:
+def test_the_side_of_a_part_below_its_sloped_top_is_no_piece_of_that():
     """Its points lie at the rim; their feet on the top, which rises towards it, lie well inside."""
     thick, slope = 0.004, np.tan(0.3)
     belongs = pin.SE3(pin.rpy.rpyToMatrix(0.0, -0.3, 0.0), np.array([0.0, 0.0, thick]))

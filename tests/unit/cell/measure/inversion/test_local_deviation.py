@@ -47,7 +47,7 @@ def rim(at: list[float], cloud: Cloud, edge: list[float] = ACROSS, faces: Nomina
 
 
 @pytest.mark.parametrize("seed", [0, 3, 6])
-def test_of_a_part_as_drawn_the_points_about_each_feature_say_no_more_than_its_pose(seed: int) -> None:
+def test_of_a_part_as_drawn_the_points_about_each_feature_say_no_more_than_its_pose(seed: int):
     shift = 0.0015 + 0.1 * seed * LINES_M, -0.001 + 0.1 * seed * ROWS_M
     cloud = scanned(lambda x, y: np.where(np.abs(x) < HALF, THICK, 0.0 * y), seed, shift=shift)
     for at, edge, apart in ((RIGHT, ACROSS, LINES_M), (LEFT, ACROSS, LINES_M), (FRONT, ALONG, ROWS_M)):
@@ -59,7 +59,7 @@ def test_of_a_part_as_drawn_the_points_about_each_feature_say_no_more_than_its_p
         assert [way.tolist() for _, way in found.spans] == [[0.0, 0.0, 1.0], outward.tolist()]
 
 
-def test_a_flat_that_is_worn_about_a_feature_is_so_much_lower_there_and_nowhere_else() -> None:
+def test_a_flat_that_is_worn_about_a_feature_is_so_much_lower_there_and_nowhere_else():
     local = in_surface(swept(0.0))
     local[np.hypot(local[..., 0], local[..., 1]) < 5e-3, 2] -= 0.3e-3
     worn = with_local(swept(0.0), local)
@@ -71,14 +71,14 @@ def test_a_flat_that_is_worn_about_a_feature_is_so_much_lower_there_and_nowhere_
 
 
 @pytest.mark.parametrize("right", [0.9e-3, -0.9e-3])
-def test_a_part_that_was_cut_or_grew_ends_so_much_sooner_or_later(right: float) -> None:
+def test_a_part_that_was_cut_or_grew_ends_so_much_sooner_or_later(right: float):
     found = rim(RIGHT, ends(right))
     assert found.least < right < found.most
     assert np.sign(found.off) == np.sign(right) and abs(right) < abs(found.off) + found.more
     assert rim(LEFT, ends(right)).off == 0.0
 
 
-def test_an_end_that_is_cut_off_farther_than_is_looked_is_gone() -> None:
+def test_an_end_that_is_cut_off_farther_than_is_looked_is_gone():
     found = rim(RIGHT, ends(-9e-3))
     assert found.most < -5e-3 and found.off == found.most
     # Where the sweep shows nothing at all, nobody knows.
@@ -86,7 +86,7 @@ def test_an_end_that_is_cut_off_farther_than_is_looked_is_gone() -> None:
     assert about(RIGHT, without(cloud, in_surface(cloud)[..., 0] > HALF - 9e-3), ACROSS).rim is None
 
 
-def test_an_edge_at_an_angle_to_the_lines_is_looked_for_square_to_itself() -> None:
+def test_an_edge_at_an_angle_to_the_lines_is_looked_for_square_to_itself():
     turn = pin.exp3(np.array([0.0, 0.0, 0.5]))
     square = NominalSurface(np.array([[-8, -8, 0], [8, -8, 0], [8, 8, 0], [-8, 8, 0]]) * 1e-3 @ turn.T, TOP.triangles)
 
@@ -102,7 +102,7 @@ def test_an_edge_at_an_angle_to_the_lines_is_looked_for_square_to_itself() -> No
     assert longer.farther.off > 0.3e-3 and np.allclose(longer.outward, turn[:, 0])
 
 
-def test_what_is_no_rim_in_the_drawing_or_does_not_show_says_nothing() -> None:
+def test_what_is_no_rim_in_the_drawing_or_does_not_show_says_nothing():
     cloud = swept(0.0)
     assert about(MIDDLE, cloud, ACROSS).rim is None, "the face goes on"
     assert about([HALF + 5e-3, 0.0, 0.0], cloud, ACROSS).rim is None, "drawn elsewhere"
@@ -113,7 +113,7 @@ def test_what_is_no_rim_in_the_drawing_or_does_not_show_says_nothing() -> None:
     assert about(RIGHT, without(cloud, np.ones(cloud.shape, dtype=bool)), ACROSS).spans == ()
 
 
-def test_a_sweep_that_ends_before_the_rim_says_nothing_of_it() -> None:
+def test_a_sweep_that_ends_before_the_rim_says_nothing_of_it():
     cloud = swept(0.0)
     assert rim(FRONT, without(cloud, in_surface(cloud)[..., 1] > 17e-3), ALONG).off == 0.0
     cut = scanned(lambda x, y: np.where((np.abs(x) < HALF) & (y < 17e-3), THICK, 0.0 * y), 5)
@@ -121,14 +121,14 @@ def test_a_sweep_that_ends_before_the_rim_says_nothing_of_it() -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_side_that_leans_outward_is_no_part_of_the_face_above_it(seed: int) -> None:
+def test_a_side_that_leans_outward_is_no_part_of_the_face_above_it(seed: int):
     """By 15 deg: between the face and the ground the sweep sees it."""
     side = np.tan(np.radians(75.0))
     leaning = scanned(lambda x, y: np.clip(THICK - side * (np.abs(x) - HALF), 0.0, THICK), seed)
     assert rim(RIGHT, leaning).off == 0.0 and rim(LEFT, leaning).off == 0.0
 
 
-def test_a_rim_that_is_drawn_round_is_looked_for_where_it_is_drawn() -> None:
+def test_a_rim_that_is_drawn_round_is_looked_for_where_it_is_drawn():
     turns = np.linspace(0.0, 2.0 * np.pi, 73)[:-1]
     corners = 3e-3 * np.stack([np.cos(turns), np.sin(turns), 0.0 * turns], axis=1)
     disc = NominalSurface(np.vstack([corners, np.zeros(3)]), [[k, (k + 1) % 72, 72] for k in range(72)])
@@ -136,7 +136,7 @@ def test_a_rim_that_is_drawn_round_is_looked_for_where_it_is_drawn() -> None:
     assert rim([0.0, 3e-3, 0.0], cloud, ALONG, disc).off == 0.0
 
 
-def test_a_rim_that_something_higher_may_hide_is_not_told_to_end_too_soon() -> None:
+def test_a_rim_that_something_higher_may_hide_is_not_told_to_end_too_soon():
     tower = np.array([[5, -4, 12], [12, -4, 12], [12, 4, 12], [5, 4, 12]]) * 1e-3
     both = NominalSurface(np.concatenate([TOP.vertices, tower]), [*TOP.triangles, [4, 5, 6], [4, 6, 7]])
     assert rim(RIGHT, ends(-0.9e-3)).off < 0.0
@@ -144,7 +144,7 @@ def test_a_rim_that_something_higher_may_hide_is_not_told_to_end_too_soon() -> N
     assert rim(RIGHT, ends(0.9e-3), faces=both).off > 0.0
 
 
-def test_a_vehicle_that_rocks_hides_as_much_of_a_height() -> None:
+def test_a_vehicle_that_rocks_hides_as_much_of_a_height():
     cloud = swept(0.0)
     still, rocked = (about(MIDDLE, cloud, rocks=rocks).higher for rocks in (0.0, 0.1e-3))
     assert rocked.most == pytest.approx(still.most + 0.2e-3) and rocked.least == pytest.approx(still.least - 0.2e-3)
@@ -198,7 +198,7 @@ def middle(cloud: Cloud, faces: NominalSurface, at: tuple[float, float, float] =
 
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(("drawn", "faces"), KINDS, ids=["hole", "pin"])
-def test_a_hole_and_a_pin_as_drawn_lie_in_their_place(drawn: partial[Array], faces: NominalSurface, seed: int) -> None:
+def test_a_hole_and_a_pin_as_drawn_lie_in_their_place(drawn: partial[Array], faces: NominalSurface, seed: int):
     shift = 0.0015 + 0.1 * seed * LINES_M, -0.001 + 0.1 * seed * ROWS_M
     spans = middle(scanned(drawn, seed, shift=shift), faces)
     assert len(spans) == 2
@@ -210,7 +210,7 @@ def test_a_hole_and_a_pin_as_drawn_lie_in_their_place(drawn: partial[Array], fac
 @pytest.mark.parametrize(("drawn", "faces"), KINDS, ids=["hole", "pin"])
 def test_one_that_lies_aside_is_told_so_and_one_that_is_wider_is_not(
     drawn: partial[Array], faces: NominalSurface, by: tuple[float, float]
-) -> None:
+):
     spans = middle(scanned(partial(drawn, by=by), 5), faces)
     for span, true in zip(spans, by, strict=True):
         assert span.least < true < span.most
@@ -219,7 +219,7 @@ def test_one_that_lies_aside_is_told_so_and_one_that_is_wider_is_not(
 
 
 @pytest.mark.parametrize("by", [0.0, 0.8e-3])
-def test_the_face_about_a_hole_may_be_inclined(by: float) -> None:
+def test_the_face_about_a_hole_may_be_inclined(by: float):
     slope = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.25, 0.0, 1.0]])
     inclined = NominalSurface(HOLE.vertices @ slope.T, HOLE.triangles)
 
@@ -231,7 +231,7 @@ def test_the_face_about_a_hole_may_be_inclined(by: float) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_glint_or_a_drawn_neighbour_beside_a_pin_moves_its_middle_by_nothing(seed: int) -> None:
+def test_a_glint_or_a_drawn_neighbour_beside_a_pin_moves_its_middle_by_nothing(seed: int):
     for spans in (middle(scanned(pinned, seed, outliers=0.03), PIN), middle(*beside_a_bar(seed))):
         assert all(span.off == 0.0 for span in spans), spans
 
@@ -251,7 +251,7 @@ def beside_a_bar(seed: int) -> tuple[Cloud, NominalSurface]:
     return scanned(height, seed), faces
 
 
-def test_where_no_hole_is_drawn_or_too_little_of_it_shows_nothing_is_told() -> None:
+def test_where_no_hole_is_drawn_or_too_little_of_it_shows_nothing_is_told():
     cloud = scanned(pierced, 5)
     assert middle(cloud, TOP) == [], "the plate goes on"
     assert middle(cloud, HOLE, (-0.012, 0.0, 0.0)) == [], "the rim is too far away"

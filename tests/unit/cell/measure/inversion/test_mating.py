@@ -49,14 +49,14 @@ def part() -> NominalSurface:
 
 
 @pytest.mark.parametrize("name", ["pot", "seat", "panel"])
-def test_a_part_of_the_same_drawing_lies_on_the_surface(name: str) -> None:
+def test_a_part_of_the_same_drawing_lies_on_the_surface(name: str):
     nominal, above = drawn(name)
     found = drawn_gap(nominal, HERE, surface_of(above))
     assert np.abs(found.gaps).max() < 1e-6 and found.seen > 0.95
     assert found.problem(TOLERANCE) is None and found.notes == ()
 
 
-def test_the_gap_is_what_a_ray_measures() -> None:
+def test_the_gap_is_what_a_ray_measures():
     """A part that is shifted and turned: rays from the surface along the part's z axis meet it so far off."""
     lies = pin.SE3(pin.rpy.rpyToMatrix(0.004, -0.003, 0.01), np.array([0.4e-3, -0.2e-3, 0.3e-3]))
     found = drawn_gap(POT, lies, part())
@@ -77,7 +77,7 @@ def test_the_gap_is_what_a_ray_measures() -> None:
     ("height", "told"),
     [(-0.5e-3, r"goes 0\.50 mm into the surface at .*Allowed are 0\.30 mm.*datum"), (0.5e-3, r"lies 0\.50 mm or more")],
 )
-def test_a_mesh_in_another_datum_is_refused_with_how_much_and_what_to_see_to(height: float, told: str) -> None:
+def test_a_mesh_in_another_datum_is_refused_with_how_much_and_what_to_see_to(height: float, told: str):
     found = drawn_gap(POT, moved(z=height), part())
     with pytest.raises(RefusedError, match=told) as refused:
         found.require(TOLERANCE)
@@ -86,7 +86,7 @@ def test_a_mesh_in_another_datum_is_refused_with_how_much_and_what_to_see_to(hei
     found.require(4 * abs(height))
 
 
-def test_a_wrong_revision_is_refused_where_it_differs() -> None:
+def test_a_wrong_revision_is_refused_where_it_differs():
     other = surface_of(body(POT.vertices, POT.triangles, stepped))
     found = drawn_gap(POT, HERE, other)
     assert found.overlap == pytest.approx(0.5e-3, abs=2e-6)
@@ -94,7 +94,7 @@ def test_a_wrong_revision_is_refused_where_it_differs() -> None:
     assert "goes 0.50 mm into the surface at (1" in str(found.problem(TOLERANCE))
 
 
-def test_one_square_of_noise_is_no_overlap() -> None:
+def test_one_square_of_noise_is_no_overlap():
     gaps, noise = np.array([0.0, -0.5e-3]), np.array([1e-6, 0.3e-3])
     found = MatingGap(np.zeros((2, 3)), gaps, noise, 1.0, np.zeros((2, 3)))
     assert found.overlap == pytest.approx(0.2e-3)
@@ -102,7 +102,7 @@ def test_one_square_of_noise_is_no_overlap() -> None:
     assert replace(found, noise=1e-6 * np.ones(2)).problem(TOLERANCE) is not None
 
 
-def test_what_is_off_contact_brings_a_part_back_that_goes_into_the_surface() -> None:
+def test_what_is_off_contact_brings_a_part_back_that_goes_into_the_surface():
     off = pin.SE3(pin.exp3(np.array([0.002, -0.001, 0.003])), np.array([0.2e-3, -0.15e-3, -0.05e-3]))
     found = drawn_gap(POT, off, part())
     assert found is not None and 0.05e-3 < found.interference < found.overlap
@@ -114,7 +114,7 @@ def test_what_is_off_contact_brings_a_part_back_that_goes_into_the_surface() -> 
     assert abs(rough.interference) < 5e-6, "noise alone"
 
 
-def test_the_scanned_surface_tells_the_same(placed_pot: JobRecord) -> None:
+def test_the_scanned_surface_tells_the_same(placed_pot: JobRecord):
     cloud, pose = placed_pot.results["reconstruct"].cloud, placed_pot.results["invert_pose"].base_from_surface
     fits = scanned_gap(cloud, pose, POT, HERE, part())
     assert fits is not None and max(fits.overlap, np.abs(np.median(fits.gaps))) < 0.03e-3
@@ -129,11 +129,11 @@ def test_the_scanned_surface_tells_the_same(placed_pot: JobRecord) -> None:
     assert "lie over what was scanned" in less.notes[0] and "scan.length" in less.notes[0]
 
 
-def test_a_part_that_lies_elsewhere_has_nothing_below_it() -> None:
+def test_a_part_that_lies_elsewhere_has_nothing_below_it():
     assert drawn_gap(POT, moved(x=0.2), part()) is None
 
 
-def test_figures_are_for_people_and_for_the_journal() -> None:
+def test_figures_are_for_people_and_for_the_journal():
     found = MatingGap(np.zeros((3, 3)), np.array([-0.12e-3, 0.0, 0.3e-3]), np.zeros(3), 0.87, np.zeros((3, 3)))
     assert found.words == "gap -0.12 to 0.30 mm, 0.00 mm in the middle; 87 % of it seen"
     assert found.as_dict() == {"least_mm": -0.12, "median_mm": 0.0, "largest_mm": 0.3, "seen": 0.87}

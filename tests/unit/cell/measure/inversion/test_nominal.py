@@ -1,7 +1,5 @@
 """Promises of `cell.measure.inversion.nominal`."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -13,7 +11,7 @@ from drivers.errors import ConfigError
 PLY = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nelement face 2\n"
 
 
-def test_closest_points_of_large_triangles_agree_with_a_brute_force_search() -> None:
+def test_closest_points_of_large_triangles_agree_with_a_brute_force_search():
     vertices = np.array([[0, 0, 0], [0.03, 0, 0], [0.03, 0.02, 0.004], [0, 0.02, 0.001]], dtype=float)
     surface = NominalSurface(vertices, [[0, 1, 2], [0, 2, 3]], rim=0.0)
     s, t = np.meshgrid(np.linspace(0, 1, 400), np.linspace(0, 1, 400))
@@ -27,7 +25,7 @@ def test_closest_points_of_large_triangles_agree_with_a_brute_force_search() -> 
     assert np.all(exact <= brute + 1e-12) and np.all(brute - exact < 5e-5)
 
 
-def test_the_rim_of_a_large_triangle_is_left_out() -> None:
+def test_the_rim_of_a_large_triangle_is_left_out():
     corners = [[0.0, 0.0, 0.0], [0.04, 0.0, 0.0], [0.04, 0.04, 0.0], [0.0, 0.04, 0.0]]
     plate = NominalSurface(corners, [[0, 1, 2], [0, 2, 3]])
     found = plate.deviations([[0.02, 0.0003, 1e-4], [0.02, 0.001, 1e-4]])
@@ -39,9 +37,7 @@ def test_the_rim_of_a_large_triangle_is_left_out() -> None:
     ("corner", "second", "words"),
     [("9 9 0", "0 2 3", ""), ("9 9 0", "0 3 2", "opposite ways"), ("9 9 nan", "0 2 3", "not")],
 )
-def test_a_mesh_whose_sides_or_corners_are_not_told_is_refused(
-    tmp_path: Path, corner: str, second: str, words: str
-) -> None:
+def test_a_mesh_whose_sides_or_corners_are_not_told_is_refused(tmp_path, corner: str, second: str, words: str):
     text = f"property list uchar int vertex_indices\nend_header\n0 0 0\n9 0 0\n{corner}\n0 9 0\n3 0 1 2\n3 {second}\n"
     (tmp_path / "surface.ply").write_text(PLY + text)
     if not words:
@@ -51,7 +47,7 @@ def test_a_mesh_whose_sides_or_corners_are_not_told_is_refused(
         read_mesh(tmp_path / "surface.ply", "mm")
 
 
-def test_a_tube_of_long_thin_triangles_has_no_more_samples_than_another_mesh() -> None:
+def test_a_tube_of_long_thin_triangles_has_no_more_samples_than_another_mesh():
     angle = np.linspace(0.0, np.pi, 33)
     near = 0.02 * np.stack([0.0 * angle, np.cos(angle), np.sin(angle)], axis=1)
     far = near + np.array([0.3, 0.0, 0.0])

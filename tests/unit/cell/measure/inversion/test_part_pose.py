@@ -33,7 +33,7 @@ def part(kind: str) -> NominalSurface:
     return NominalSurface(made.vertices, made.faces)
 
 
-def test_what_faces_up_is_seen_and_nothing_else() -> None:
+def test_what_faces_up_is_seen_and_nothing_else():
     faces = seen_from_above(part("shell"), HERE)
     low, high = faces.extent
     assert low[2] > HEIGHT - 0.01 and high[2] < HEIGHT + 0.012
@@ -52,7 +52,7 @@ def test_what_faces_up_is_seen_and_nothing_else() -> None:
         ("cone", ("rotation about the z",)),
     ],
 )
-def test_the_motions_that_the_faces_do_not_show_are_named(kind: str, unseen: tuple[str, ...]) -> None:
+def test_the_motions_that_the_faces_do_not_show_are_named(kind: str, unseen: tuple[str, ...]):
     found = shown_by(seen_from_above(part(kind), HERE), TOLERANCE)
     assert len(found) == len(unseen)
     assert all(any(name.startswith(one) and name.endswith("part frame") for name in found) for one in unseen)
@@ -78,7 +78,7 @@ def found(moved: Callable[[Array], Array], before: Prior = SWEPT) -> PartPose:
     )  # fmt: skip
 
 
-def test_what_moves_part_and_surface_alike_leaves_nothing_open_and_what_moves_one_does() -> None:
+def test_what_moves_part_and_surface_alike_leaves_nothing_open_and_what_moves_one_does():
     def alike(points: Array) -> Array:
         """Six motions of a rigid body, .2 mm, and .5 mrad about the arm's foot, 0.75 m away."""
         turned = 0.5e-3 * np.cross(np.eye(3)[None], points[:, None]).transpose(0, 2, 1)
@@ -98,7 +98,7 @@ def test_what_moves_part_and_surface_alike_leaves_nothing_open_and_what_moves_on
 
 
 @pytest.mark.parametrize("slid", [0.0, 4e-3, 12e-3])
-def test_a_surface_that_slid_under_the_part_is_found_where_it_is(slid: float) -> None:
+def test_a_surface_that_slid_under_the_part_is_found_where_it_is(slid: float):
     there = TRUE * pin.SE3(np.eye(3), np.array([0.0, slid, 0.0]))
     seen = found(nothing, Prior(there, 0.01 * BOARD))
     assert np.linalg.norm(seen.surface_from_part.translation) < 0.1e-3 and (seen.moved is None) == (slid == 0.0)

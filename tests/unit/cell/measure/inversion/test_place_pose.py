@@ -42,20 +42,20 @@ def board(sigma: float, off: float = 0.0) -> Prior:
 
 
 @pytest.mark.parametrize("off", [0.003, 0.0], ids=["nearer to the other", "nearer to this one"])
-def test_a_pattern_that_the_board_does_not_place_is_refused_with_its_pitch(off: float) -> None:
+def test_a_pattern_that_the_board_does_not_place_is_refused_with_its_pitch(off: float):
     with pytest.raises(RefusedError, match=r"looks the same elsewhere: shifted by \(-?5\.0, ") as refused:
         invert_pose(scanned(waves, 1), nominal(waves), board(0.002, off=off), JOB)
     assert "surface.prior_sigma" in str(refused.value)
     assert refused.value.numbers[0].least == 5.0
 
 
-def test_the_same_pattern_is_found_where_the_board_knows_better() -> None:
+def test_the_same_pattern_is_found_where_the_board_knows_better():
     found = invert_pose(scanned(waves, 2), nominal(waves), board(0.0005, off=0.0004), JOB)
     assert np.linalg.norm(found.base_from_surface.translation - TRUE.translation) < 1e-4
 
 
 @pytest.mark.parametrize("height", [waves_with_an_end, freeform])
-def test_what_comes_once_only_tells_the_place(height: Height) -> None:
+def test_what_comes_once_only_tells_the_place(height: Height):
     found = invert_pose(scanned(height, 3), nominal(height), board(0.002, off=0.0015), JOB)
     assert np.linalg.norm(found.base_from_surface.translation - TRUE.translation) < 1e-4
 
@@ -77,7 +77,7 @@ def uneven(size: float) -> Cloud:
 
 
 @pytest.mark.parametrize("size", [0.0, 15e-6])
-def test_what_a_patch_shares_is_found_and_counts_for_what_few_patches_tell(size: float) -> None:
+def test_what_a_patch_shares_is_found_and_counts_for_what_few_patches_tell(size: float):
     found = register(Scan.of(uneven(size)), nominal(ledges), Prior(TRUE, BOARD))
     sigma, by_patches = shared_by_patches(found)
     assert sigma == pytest.approx(size, rel=0.25, abs=2 * SIGMA_FLOOR)
@@ -96,7 +96,7 @@ def test_what_a_patch_shares_is_found_and_counts_for_what_few_patches_tell(size:
     assert shared[2] < 3e-6
 
 
-def test_the_stated_deviation_holds_where_neighbours_err_together(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_stated_deviation_holds_where_neighbours_err_together(monkeypatch):
     # Believed to the last point: the rule that leaves what few points tell to the board is another one.
     monkeypatch.setattr("cell.measure.inversion.observability.FEW", 0.0)
     found = invert_pose(uneven(15e-6), nominal(ledges), Prior(TRUE, BOARD), JOB)
@@ -106,7 +106,7 @@ def test_the_stated_deviation_holds_where_neighbours_err_together(monkeypatch: p
     assert found.sigma[5] > 2.0 * np.sqrt(found.random[5, 5])
 
 
-def test_what_the_arm_is_off_by_counts_where_the_board_decides_as_well() -> None:
+def test_what_the_arm_is_off_by_counts_where_the_board_decides_as_well():
     def ridge(x: Array, y: Array) -> Array:
         return 0.006 * np.exp(-((y / 0.006) ** 2))
 

@@ -4,7 +4,6 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -90,7 +89,7 @@ def inverted(height: Height, cloud: Cloud, prior: Prior, **options: object) -> P
     return invert_pose(cloud, nominal(height), prior, JOB, **options)  # type: ignore[arg-type]
 
 
-def test_distances_to_the_mesh_are_those_to_the_closed_form_surface() -> None:
+def test_distances_to_the_mesh_are_those_to_the_closed_form_surface():
     surface = nominal(freeform, 0.015, 0.01, step=0.00025)
     rng = np.random.default_rng(0)
     x, y = rng.uniform(-0.014, 0.014, 1000), rng.uniform(-0.009, 0.009, 1000)
@@ -102,12 +101,12 @@ def test_distances_to_the_mesh_are_those_to_the_closed_form_surface() -> None:
     assert np.abs(found - height).max() < 2e-6
 
 
-def test_points_beside_the_surface_have_no_deviation() -> None:
+def test_points_beside_the_surface_have_no_deviation():
     beside = np.array([[0.0352, 0.0, 0.0], [0.0, 0.0185, 0.005], [0.06, 0.0, 0.0], [np.nan] * 3])
     assert np.all(np.isnan(nominal(freeform).deviations(beside)))
 
 
-def test_a_mesh_is_read_in_its_unit_and_refused_in_the_wrong_one(tmp_path: Path) -> None:
+def test_a_mesh_is_read_in_its_unit_and_refused_in_the_wrong_one(tmp_path):
     surface = nominal(seat)
     path = tmp_path / "seat.stl"
     trimesh.Trimesh(surface.vertices * 1e3, surface.triangles).export(path)
@@ -121,7 +120,7 @@ def test_a_mesh_is_read_in_its_unit_and_refused_in_the_wrong_one(tmp_path: Path)
 
 
 @pytest.mark.parametrize("height", [freeform, seat])
-def test_the_true_pose_is_found_from_the_boards_with_the_uncertainty_stated(height: Height) -> None:
+def test_the_true_pose_is_found_from_the_boards_with_the_uncertainty_stated(height: Height):
     rng = np.random.default_rng(5)
     scores = []
     for seed in range(6):
@@ -134,14 +133,14 @@ def test_the_true_pose_is_found_from_the_boards_with_the_uncertainty_stated(heig
     assert 6 - 4 * np.sqrt(12 / 6) < np.mean(scores) < 6 + 4 * np.sqrt(12 / 6)
 
 
-def test_a_prior_that_is_sharper_than_the_scan_is_followed() -> None:
+def test_a_prior_that_is_sharper_than_the_scan_is_followed():
     sharp = np.diag([1e-7**2] * 3 + [1e-6**2] * 3)
     board = perturbed(TRUE, [2e-5, -1e-5, 0, 0, 0, 1e-4])
     found = register(Scan.of(scanned(freeform, 1), 3000), nominal(freeform), Prior(board, sharp))
     assert np.abs(difference(found.base_from_surface, board)).max() < 1e-6
 
 
-def test_sweeps_that_can_have_no_error_leave_the_pose_where_board_and_scan_have_it() -> None:
+def test_sweeps_that_can_have_no_error_leave_the_pose_where_board_and_scan_have_it():
     prior = Prior(perturbed(TRUE, [2e-5, -1e-5, 1e-5, 0, 0, 1e-4]), np.diag([2e-6**2] * 3 + [1e-4**2] * 3))
     seen = Scan.of(scanned(freeform, 1), 3000)
     found = register(seen, nominal(freeform), prior)
@@ -150,14 +149,14 @@ def test_sweeps_that_can_have_no_error_leave_the_pose_where_board_and_scan_have_
     np.testing.assert_allclose(np.diag(again.covariance), np.diag(found.covariance), rtol=0.05)
 
 
-def test_an_uncertainty_that_all_points_share_is_added() -> None:
+def test_an_uncertainty_that_all_points_share_is_added():
     arm = np.diag([1e-4**2] * 3 + [2e-4**2] * 3)
     pose = inverted(freeform, scanned(freeform, 2), Prior(TRUE, BOARD), systematic=arm)
     assert np.allclose(pose.systematic, arm, rtol=0.02)
     assert np.allclose(pose.covariance, pose.random + pose.systematic)
 
 
-def test_the_calibrations_part_is_what_a_disturbed_calibration_does() -> None:
+def test_the_calibrations_part_is_what_a_disturbed_calibration_does():
     """A scale error of the sweep and a shift of the whole cloud, as a calibration would leave them."""
     cloud, prior = scanned(freeform, 2), Prior(TRUE, BOARD)
     moved = np.stack(
@@ -174,7 +173,7 @@ def test_the_calibrations_part_is_what_a_disturbed_calibration_does() -> None:
     assert np.abs((stated.systematic - seen) / np.outer(unit, unit))[:3, :3].max() < 0.1
 
 
-def test_sweeps_that_do_not_fit_each_other_do_not_tilt_the_surface() -> None:
+def test_sweeps_that_do_not_fit_each_other_do_not_tilt_the_surface():
     """Two strips that overlap by 8 mm, the second one 35 µm too high and 20 µm aside, as the arm's rest leaves them."""
     error, sigma = np.array([2e-5, -1.5e-5, 3.5e-5]), 3e-5
     strips = []
@@ -201,13 +200,13 @@ def test_sweeps_that_do_not_fit_each_other_do_not_tilt_the_surface() -> None:
     assert told_apart.sigma[3:].max() < 1e-4
 
 
-def test_the_spin_of_a_bowl_is_not_determined_and_named() -> None:
+def test_the_spin_of_a_bowl_is_not_determined_and_named():
     cloud = scanned(bowl, 1)
     with pytest.raises(NotObservable, match=r"rotation about the z axis .*is not determined: 3σ .* mrad > 6 mrad"):
         inverted(bowl, cloud, Prior(TRUE, BOARD))
 
 
-def test_the_spin_stays_where_a_sharp_board_put_it() -> None:
+def test_the_spin_stays_where_a_sharp_board_put_it():
     sharp = np.diag([0.002**2] * 3 + [0.001**2] * 3)
     board = perturbed(TRUE, [0.0005, -0.0005, 0.001, 0.0, 0.0, 0.0008])
     pose = inverted(bowl, scanned(bowl, 1), Prior(board, sharp))
@@ -216,7 +215,7 @@ def test_the_spin_stays_where_a_sharp_board_put_it() -> None:
     assert np.linalg.norm((pose.base_from_surface.translation - TRUE.translation)[:2]) < 3e-5
 
 
-def test_a_shift_that_only_a_wall_tells_is_left_to_the_board() -> None:
+def test_a_shift_that_only_a_wall_tells_is_left_to_the_board():
     """What the few points on a wall have in common moves the pose by many of the deviations that their noise gives."""
     cloud = scanned(ledges, 1)
     found = register(Scan.of(cloud, 4000), nominal(ledges), Prior(TRUE, BOARD))
@@ -231,14 +230,14 @@ def test_a_shift_that_only_a_wall_tells_is_left_to_the_board() -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_prior_that_is_off_does_not_pull_the_pose_from_steep_walls(seed: int) -> None:
+def test_a_prior_that_is_off_does_not_pull_the_pose_from_steep_walls(seed: int):
     """Their points are known to micrometres along their normals; a coarse pose is not."""
     prior = Prior(perturbed(TRUE, [0.005, 0.001, 0.001, 0.0, 0.0, 0.0]), BOARD)
     found = register(Scan.of(scanned(ledges, seed), 4000), nominal(ledges), prior)
     assert np.linalg.norm(difference(found.base_from_surface, TRUE)[:3]) < 1e-4
 
 
-def test_a_freeform_surface_leaves_nothing_to_the_board() -> None:
+def test_a_freeform_surface_leaves_nothing_to_the_board():
     pose = inverted(freeform, scanned(freeform, 4), Prior(TRUE, BOARD))
     assert pose.verdict.unseen == ()
     assert not pose.verdict.weak
@@ -261,13 +260,13 @@ SHARP = np.diag([0.0002**2] * 3 + [0.001**2] * 3)
 )  # fmt: skip
 def test_a_scan_that_does_not_fit_is_refused(
     height: Height, missing: float, prior: Prior, demands: Demands, words: str
-) -> None:
+):
     with pytest.raises(RefusedError, match=words):
         inverted(freeform, scanned(height, 1, missing=missing), prior, demands=demands)
 
 
 @pytest.mark.parametrize("part", list(PARTS))
-def test_every_part_is_found_from_far_away_with_foreign_objects_on_it_and_40_percent_missing(part: str) -> None:
+def test_every_part_is_found_from_far_away_with_foreign_objects_on_it_and_40_percent_missing(part: str):
     rng = np.random.default_rng(17)
     for setting in (Setting(clutter=0.2), Setting(clutter=0.1, missing=0.4)):
         cloud = Scan.of(scan(PARTS[part], rng, setting), 4000)
@@ -277,7 +276,7 @@ def test_every_part_is_found_from_far_away_with_foreign_objects_on_it_and_40_per
         assert turn < 2e-3
 
 
-def test_the_motions_that_a_sphere_leaves_open_are_named_one_by_one() -> None:
+def test_the_motions_that_a_sphere_leaves_open_are_named_one_by_one():
     with pytest.raises(NotObservable) as caught:
         invert_pose(scan(PARTS["cap"], np.random.default_rng(4)), part_surface("cap"), Prior(TRUE, BOARD), JOB)
     assert str(caught.value).count("is not determined: 3σ") == 3
@@ -287,7 +286,7 @@ def test_the_motions_that_a_sphere_leaves_open_are_named_one_by_one() -> None:
         assert re.search(through, str(caught.value))
 
 
-def test_a_plane_slides_along_two_axes_and_turns_about_its_normal() -> None:
+def test_a_plane_slides_along_two_axes_and_turns_about_its_normal():
     with pytest.raises(NotObservable) as caught:
         inverted(flat, scanned(flat, 1, outliers=0.0), Prior(TRUE, BOARD))
     assert str(caught.value).count("is not determined") == 3
@@ -295,7 +294,7 @@ def test_a_plane_slides_along_two_axes_and_turns_about_its_normal() -> None:
         assert motion in str(caught.value)
 
 
-def test_a_verdict_names_what_is_known_worst_with_three_of_its_deviations() -> None:
+def test_a_verdict_names_what_is_known_worst_with_three_of_its_deviations():
     sigmas = np.array([0.1e-3, 0.15e-3, 0.1e-3, 1e-3, 1e-3, 1e-3])
     known = judge(np.diag(sigmas**2), 1e9 * np.eye(6), 1.0, 1, 0.02, JOB)
     assert not known.weak
@@ -313,13 +312,13 @@ def test_a_verdict_names_what_is_known_worst_with_three_of_its_deviations() -> N
 @pytest.mark.parametrize(
     "seeds", [range(1), pytest.param(range(1, 8), marks=pytest.mark.campaign)], ids=["few", "more"]
 )
-def test_no_surface_that_is_not_the_nominal_one_leads_outside_the_tolerance(case: str, seeds: range) -> None:
+def test_no_surface_that_is_not_the_nominal_one_leads_outside_the_tolerance(case: str, seeds: range):
     ended = [judge_case(case, seed).ended for seed in seeds]
     assert "outside" not in ended
     assert "refused" in ended
 
 
-def test_points_are_thinned_out_of_step_with_the_rows() -> None:
+def test_points_are_thinned_out_of_step_with_the_rows():
     cloud = scanned(freeform, 1)
     few = Scan.of(cloud, 400)
     assert (len(few.points), len(few.thinned(100).points)) == (400, 100)

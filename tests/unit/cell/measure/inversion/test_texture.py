@@ -31,7 +31,7 @@ def told(given: Heights) -> list[float]:
     return [value for value in (made.sa, made.sq, made.sz) if value is not None]
 
 
-def test_the_filter_is_that_of_scipy_also_at_edges_and_holes() -> None:
+def test_the_filter_is_that_of_scipy_also_at_edges_and_holes():
     rng = np.random.default_rng(1)
     heights, weights = rng.normal(size=(90, 70)), np.ones((90, 70))
     weights[40:43, 20:24] = weights[60:80, 40:60] = 0.0
@@ -45,21 +45,21 @@ def test_the_filter_is_that_of_scipy_also_at_edges_and_holes() -> None:
 
 
 @pytest.mark.parametrize("wavelength", [0.5, 1.0, 2.0, 5.0])
-def test_half_of_a_wave_of_the_cutoffs_length_comes_through(wavelength: float) -> None:
+def test_half_of_a_wave_of_the_cutoffs_length_comes_through(wavelength: float):
     cutoff, cells = 20.0, np.arange(401) - 200.0
     wave = np.cos(2.0 * np.pi * cells / (wavelength * cutoff))[:, None] * np.ones((401, 60))
     through = gaussian(wave, np.ones_like(wave), cutoff, EDGE_WEIGHT)[200, 30]
     assert through == pytest.approx(2.0 ** -(wavelength**-2.0), abs=1e-6)
 
 
-def test_a_sine_has_the_parameters_of_its_closed_form() -> None:
+def test_a_sine_has_the_parameters_of_its_closed_form():
     sa, sq, sz = told(scanned(sine(0.05e-3)))
     through = 0.05e-3 * 2.0 ** -((INDEX / WAVE) ** 2)
     assert (sa, sq) == (pytest.approx(2.0 * through / np.pi, rel=0.02), pytest.approx(through / np.sqrt(2.0), rel=0.01))
     assert sz == pytest.approx(2.0 * through, rel=0.05)  # the form bends them
 
 
-def test_form_and_pose_are_no_waviness() -> None:
+def test_form_and_pose_are_no_waviness():
     x, y = PITCH * np.arange(LINES)[:, None], STEP * np.arange(ROWS)
     bowl = 1e-3 + 0.01 * x - 0.02 * y + 0.3 * x**2 - 0.2 * x * y + 0.5 * y**2
     assert measure_texture(scanned(bowl)).sq is None
@@ -77,13 +77,13 @@ def noisy(seed: int, lines: float = 0.0) -> np.ndarray:
     return np.asarray(rng.normal(0.0, 60e-6, (LINES, ROWS)) + rng.normal(0.0, lines, (LINES, 1)))
 
 
-def test_noise_is_never_taken_for_a_surface() -> None:
+def test_noise_is_never_taken_for_a_surface():
     for made in (measure_texture(scanned(noisy(seed, lines=20e-6))) for seed in range(6)):
         assert (made.sa, made.sq, made.sz) == (None, None, None) and made.limit is not None
         assert f"below {1e3 * made.limit:.4f} mm cannot be told from the sensor's noise" in made.reason
 
 
-def test_the_noise_is_taken_out_of_the_figures() -> None:
+def test_the_noise_is_taken_out_of_the_figures():
     plain = told(scanned(sine(0.06e-3)))[1]
     made = [measure_texture(scanned(sine(0.06e-3) + noisy(seed))) for seed in range(8)]
     off = np.array([(each.sq or np.nan) / plain - 1.0 for each in made])
@@ -91,7 +91,7 @@ def test_the_noise_is_taken_out_of_the_figures() -> None:
     assert abs(off.mean()) < 0.01 < 0.05 < raw.mean() and np.abs(off).max() < 0.05
 
 
-def test_what_calibration_and_vehicle_leave_open_raises_the_limit() -> None:
+def test_what_calibration_and_vehicle_leave_open_raises_the_limit():
     plain, shaken = measure_texture(scanned(sine(0.03e-3))), measure_texture(scanned(sine(0.03e-3), shaken=0.03e-3))
     unsure = measure_texture(scanned(sine(0.03e-3), unsure=5e-6))
     assert unsure.limit is not None and plain.limit == pytest.approx(SIGMA_FLOOR, rel=0.3)
@@ -106,7 +106,7 @@ def without(given: Heights, gone: np.ndarray) -> Heights:
     return Heights(places, heights, slopes, lines, given.steps, np.arange(len(lines)), np.zeros((len(lines), 1)))
 
 
-def test_holes_and_an_outline_that_is_no_rectangle_change_little() -> None:
+def test_holes_and_an_outline_that_is_no_rectangle_change_little():
     whole = scanned(sine(0.1e-3) + 0.2 * noisy(1))
     x, y = whole.places.T
     holes = (np.abs(x - 0.02) < 0.001) & (np.abs(y - 0.01) < 0.001) | (np.hypot(x - 0.04, y - 0.02) < 0.005)
@@ -116,7 +116,7 @@ def test_holes_and_an_outline_that_is_no_rectangle_change_little() -> None:
     assert made.sq == pytest.approx(told(whole)[1], rel=0.03)
 
 
-def test_too_little_gives_no_figure_but_the_reason() -> None:
+def test_too_little_gives_no_figure_but_the_reason():
     whole = scanned(sine(0.1e-3))
     few = measure_texture(without(whole, np.arange(len(whole.lines)) >= 300))
     assert few.reason == "300 points lie over the surface, at least 500 are needed"

@@ -38,7 +38,7 @@ def looked(cloud: Cloud, faces: NominalSurface = TOP, lies: pin.SE3 = BELONGS) -
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_part_as_drawn_and_one_that_is_a_little_short_are_all_there(seed: int) -> None:
+def test_a_part_as_drawn_and_one_that_is_a_little_short_are_all_there(seed: int):
     for height, faces in ((part, TOP), (pierced, HOLE), (pinned, PIN)):
         assert looked(scanned(height, seed, outliers=0.05), faces) is None
     short = scanned(lambda x, y: np.where(x > HALF - 2.0e-3, 0.0, part(x, y)), seed)
@@ -52,7 +52,7 @@ def test_a_part_as_drawn_and_one_that_is_a_little_short_are_all_there(seed: int)
 )
 def test_what_is_gone_or_covered_is_told_with_its_size_and_place(
     height: Callable[[Array, Array], Array], area: float, at: tuple[float, float], gone: bool
-) -> None:
+):
     found = looked(scanned(height, 5))
     assert found is not None and found.gone is gone
     # Squares at a rim do not count.
@@ -61,7 +61,7 @@ def test_what_is_gone_or_covered_is_told_with_its_size_and_place(
     assert found.as_dict()["gone"] is gone and ("is not there" if gone else "stands on it") in found.words
 
 
-def test_a_part_that_is_turned_and_shifted_is_told_in_its_own_frame() -> None:
+def test_a_part_that_is_turned_and_shifted_is_told_in_its_own_frame():
     turn = pin.exp3(np.array([0.0, 0.0, 0.5 * np.pi]))
     lies = from_parts((2e-3, -1e-3, THICK), turn)
     there = lies.actInv(np.array([HALF - 5e-3 + 2e-3, 12e-3 - 1e-3, THICK]))
@@ -71,7 +71,7 @@ def test_a_part_that_is_turned_and_shifted_is_told_in_its_own_frame() -> None:
 
 
 @pytest.mark.parametrize("wide", [1.2e-3, 2.3e-3])
-def test_a_slot_through_the_part_is_no_face_that_is_gone(wide: float) -> None:
+def test_a_slot_through_the_part_is_no_face_that_is_gone(wide: float):
     """Of which a sliver of a square is left to either side."""
     for k in range(0, 8, 2):
         left = 0.25e-3 * k + 0.1e-3
@@ -88,7 +88,7 @@ def test_a_slot_through_the_part_is_no_face_that_is_gone(wide: float) -> None:
         assert looked(scanned(slot, k), NominalSurface(corners, faces)) is None, left
 
 
-def test_spots_far_apart_are_no_patch_and_the_largest_piece_tells_where() -> None:
+def test_spots_far_apart_are_no_patch_and_the_largest_piece_tells_where():
     def spotted(x: Array, y: Array) -> Array:
         spots = [np.hypot(x - a, y - b) < 2.2e-3 for a in (-15e-3, 15e-3) for b in (-11e-3, 11e-3)]
         return np.where(np.any(spots, axis=0), THICK + 3e-3, part(x, y))
@@ -98,7 +98,7 @@ def test_spots_far_apart_are_no_patch_and_the_largest_piece_tells_where() -> Non
     assert found is not None and found.gone and np.hypot(*(found.at[:2] - (HALF - 5e-3, 12e-3))) < 3e-3
 
 
-def test_long_thin_triangles_are_asked_as_closely_as_others() -> None:
+def test_long_thin_triangles_are_asked_as_closely_as_others():
     """A plate of 400 strips of its whole width, each two triangles."""
     x = np.linspace(-HALF, HALF, 401)
     corners = np.column_stack([np.tile(x, 2), np.repeat([-0.018, 0.018], 401), np.zeros(802)])
@@ -107,7 +107,7 @@ def test_long_thin_triangles_are_asked_as_closely_as_others() -> None:
     assert found is not None and found.gone and 1e6 * found.area > 60.0
 
 
-def test_what_the_sweep_does_not_show_is_not_told_as_gone() -> None:
+def test_what_the_sweep_does_not_show_is_not_told_as_gone():
     cloud = scanned(corner, 5)
     local = in_surface(cloud)
     assert looked(without(cloud, (local[..., 0] > HALF - 10e-3) & (local[..., 1] > 6e-3))) is None

@@ -60,14 +60,14 @@ def built(noise: float = 0.0, lines: int = 60) -> Cloud:
     return swept(GEOMETRY, profiles, 1e-6, BASE_FROM_FLANGE)
 
 
-def test_the_table_is_where_an_independent_projection_puts_it() -> None:
+def test_the_table_is_where_an_independent_projection_puts_it():
     cloud = built()
     assert cloud.shape == (60, 480)
     assert np.abs(cloud.points[:, :, 2] - TABLE).max() < 1e-7
     assert not cloud.rejected.any()
 
 
-def test_the_noise_of_the_points_is_what_the_cloud_says() -> None:
+def test_the_noise_of_the_points_is_what_the_cloud_says():
     cloud = built(noise=0.08)
     lines, rows = np.nonzero(cloud.valid)
     up = np.tile([0.0, 0.0, 1.0], (len(lines), 1))
@@ -80,7 +80,7 @@ def test_the_noise_of_the_points_is_what_the_cloud_says() -> None:
     assert np.allclose(full, sigma)
 
 
-def test_an_error_of_the_rail_moves_a_whole_line_as_its_spread_says() -> None:
+def test_an_error_of_the_rail_moves_a_whole_line_as_its_spread_says():
     seen = [(profile(table_stripe(rail)), rail) for rail in np.linspace(0.04, 0.05, 10)]
     told = ([(one, rail + error) for one, rail in seen] for error in (0.0, 2e-5))
     clouds = [swept(GEOMETRY, profiles, 2e-5, BASE_FROM_FLANGE) for profiles in told]
@@ -89,7 +89,7 @@ def test_an_error_of_the_rail_moves_a_whole_line_as_its_spread_says() -> None:
     assert np.linalg.norm(clouds[0].rail_spread, axis=1) == pytest.approx(2e-5 * np.linalg.norm(RAIL))
 
 
-def test_another_calibration_moves_the_points_as_foretold() -> None:
+def test_another_calibration_moves_the_points_as_foretold():
     cloud = built()
     other = ScanGeometry(CAMERA, LightPlane.of((1.0, 0.01, -1 / 3.501), -0.03512), RAIL * 1.0002, MOUNT)
     lines, rows = cloud.subsample(500)
@@ -99,7 +99,7 @@ def test_another_calibration_moves_the_points_as_foretold() -> None:
     assert np.abs(foretold - seen).max() < 1e-9 and np.abs(foretold).max() > 1e-5
 
 
-def test_rows_without_a_stripe_are_holes_and_lines_are_sorted() -> None:
+def test_rows_without_a_stripe_are_holes_and_lines_are_sorted():
     rails = (0.042, 0.040, 0.044, 0.041, 0.043)
     centres = [table_stripe(rail) for rail in rails]
     for columns in centres:
@@ -109,14 +109,14 @@ def test_rows_without_a_stripe_are_holes_and_lines_are_sorted() -> None:
     assert cloud.size == 5 * 380
 
 
-def test_a_profile_of_another_camera_and_a_sweep_without_points_are_refused() -> None:
+def test_a_profile_of_another_camera_and_a_sweep_without_points_are_refused():
     with pytest.raises(ValueError, match="camera of 480 rows"):
         ProfileBuilder(GEOMETRY).see(profile(np.full(1024, 300.0)))
     with pytest.raises(RefusedError, match="gave 0 points in 1 profiles"):
         swept(GEOMETRY, [(profile(np.full(480, np.nan)), 0.0)], 1e-5, BASE_FROM_FLANGE)
 
 
-def test_a_subsample_is_spread_over_all_lines_and_rows() -> None:
+def test_a_subsample_is_spread_over_all_lines_and_rows():
     cloud = built()
     lines, rows = cloud.subsample(2000)
     assert len(lines) <= 2000

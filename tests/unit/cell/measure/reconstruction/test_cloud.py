@@ -73,7 +73,7 @@ def repeatability(sigma: float) -> list[Array]:
     return [np.diag([sigma**2] * 3 + [0.0] * 3)] * 2
 
 
-def test_a_merged_cloud_is_wider_and_every_point_keeps_its_place(pair: Cloud) -> None:
+def test_a_merged_cloud_is_wider_and_every_point_keeps_its_place(pair: Cloud):
     first, second = pair.each_sweep()
     assert pair.shape == (32, 480)
     assert pair.sweeps.tolist() == [0] * 16 + [1] * 16
@@ -83,7 +83,7 @@ def test_a_merged_cloud_is_wider_and_every_point_keeps_its_place(pair: Cloud) ->
     assert np.sqrt(np.nanmean(deviation**2)) < 5e-5
 
 
-def test_the_seam_shows_the_error_between_two_sweeps_beside_what_is_expected(pair: Cloud) -> None:
+def test_the_seam_shows_the_error_between_two_sweeps_beside_what_is_expected(pair: Cloud):
     (seam,) = find_seams(pair, lambda lines, rows: flange_motions(pair, lines, rows, repeatability(4e-5 / np.sqrt(2))))
     assert (seam.first, seam.second) == (0, 1)
     assert seam.points > 500
@@ -92,7 +92,7 @@ def test_the_seam_shows_the_error_between_two_sweeps_beside_what_is_expected(pai
     assert seam.rms == pytest.approx(seam.expected_rms, rel=0.15)
 
 
-def test_what_moves_both_sweeps_alike_is_not_expected_at_the_seam(pair: Cloud) -> None:
+def test_what_moves_both_sweeps_alike_is_not_expected_at_the_seam(pair: Cloud):
     def alike(lines: Indices, rows: Indices) -> Array:
         return np.full((len(lines), 3, 1), 1e-4)
 
@@ -100,12 +100,12 @@ def test_what_moves_both_sweeps_alike_is_not_expected_at_the_seam(pair: Cloud) -
     assert seam.expected_mean < 2e-6
 
 
-def test_a_sweep_without_neighbouring_lines_makes_no_seam(pair: Cloud) -> None:
+def test_a_sweep_without_neighbouring_lines_makes_no_seam(pair: Cloud):
     pair.points[0:15:2] = np.nan
     assert find_seams(pair, lambda lines, rows: flange_motions(pair, lines, rows, repeatability(1e-5))) == []
 
 
-def test_a_pose_error_moves_its_own_sweep_as_the_motions_say() -> None:
+def test_a_pose_error_moves_its_own_sweep_as_the_motions_say():
     told = [np.zeros((6, 6)), np.diag([0, 0, 9e-10, 1e-8, 0, 0])]
     cloud = merge([scanned((0, 0, 0), np.zeros(3), 1, 8), scanned((0, 0.012, 0), np.zeros(3), 2, 8)])
     lines, rows = cloud.subsample(600)
@@ -119,7 +119,7 @@ def test_a_pose_error_moves_its_own_sweep_as_the_motions_say() -> None:
     assert np.allclose(covariance[lines >= 8], expected, atol=1e-16)
 
 
-def test_a_leaning_vehicle_moves_the_base_under_the_sweeps_as_the_motions_say(pair: Cloud) -> None:
+def test_a_leaning_vehicle_moves_the_base_under_the_sweeps_as_the_motions_say(pair: Cloud):
     base_from_vehicle = pin.SE3(pin.exp3(np.array([0.0, 0.0, 0.4])), np.array([-0.3, 0.1, -0.55]))
     springs = np.array([3e-4, 5e-4])
 
@@ -140,19 +140,19 @@ def test_a_leaning_vehicle_moves_the_base_under_the_sweeps_as_the_motions_say(pa
     assert np.abs(seen - points).max() > 1e-6
 
 
-def test_a_sweep_by_the_rail_alone_does_not_move_the_base() -> None:
+def test_a_sweep_by_the_rail_alone_does_not_move_the_base():
     cloud = scanned((0, 0, 0), np.zeros(3), 1, 4)
     lines, rows = cloud.subsample(50)
     assert np.abs(lean_motions(cloud, lines, rows, pin.SE3.Identity(), 1e-3)).max() < 1e-12
 
 
-def test_a_cloud_of_moving_flanges_is_solved_again_with_each_lines_own(pair: Cloud) -> None:
+def test_a_cloud_of_moving_flanges_is_solved_again_with_each_lines_own(pair: Cloud):
     lines, rows = pair.subsample(200)
     own = calibration_motions(pair, lines, rows, None, GEOMETRY, [GEOMETRY])
     assert np.abs(own).max() < 1e-12
 
 
-def test_a_sweep_by_the_arm_lies_where_one_by_the_rail_does() -> None:
+def test_a_sweep_by_the_arm_lies_where_one_by_the_rail_does():
     rng = np.random.default_rng(3)
     builder = ProfileBuilder(GEOMETRY)
     flanges = []
@@ -174,7 +174,7 @@ def test_a_sweep_by_the_arm_lies_where_one_by_the_rail_does() -> None:
     assert abs(np.mean(z)) < 0.05
 
 
-def test_clouds_that_do_not_belong_together_are_not_merged() -> None:
+def test_clouds_that_do_not_belong_together_are_not_merged():
     one = scanned((0, 0, 0), np.zeros(3), 1, 8)
     without = replace(one, flanges=np.empty((0, 4, 4)))
     with pytest.raises(ValueError, match="does not know where the flange stood"):
@@ -202,7 +202,7 @@ CLOCKS.add([Latch(999.9999, 77.0, 1000.0001)])
 
 
 @pytest.mark.parametrize("late", [0.0005, 0.2])
-def test_late_packets_do_not_move_the_flange_not_even_if_all_are(late: float) -> None:
+def test_late_packets_do_not_move_the_flange_not_even_if_all_are(late: float):
     delays = late + np.random.default_rng(0).exponential(0.004, 200)
     track = FlangeTrack("arm", states(delays), CLOCKS)
     times = 1000.0 + np.linspace(0.1, 1.5, 40)
@@ -213,7 +213,7 @@ def test_late_packets_do_not_move_the_flange_not_even_if_all_are(late: float) ->
     assert track.inside(np.array([999.0, 1000.5, 1002.0])).tolist() == [False, True, False]
 
 
-def test_a_pause_that_no_state_tells_of_leaves_the_way_there_unknown() -> None:
+def test_a_pause_that_no_state_tells_of_leaves_the_way_there_unknown():
     whole = states(np.zeros(200))
     # For 64 ms nothing came. Either the arm went on evenly, or it stood still for half of that time and lags since.
     evenly = whole[:100] + whole[108:]
@@ -223,7 +223,7 @@ def test_a_pause_that_no_state_tells_of_leaves_the_way_there_unknown() -> None:
     assert FlangeTrack("arm", paused, CLOCKS).even(times).tolist() == [True, False, True]
 
 
-def test_a_gap_in_the_states_is_a_fault_and_not_bridged() -> None:
+def test_a_gap_in_the_states_is_a_fault_and_not_bridged():
     given = states(np.zeros(100))
     del given[40:80]
     with pytest.raises(DeviceFault, match=r"no state of the arm came for 0\.3\d* s"):

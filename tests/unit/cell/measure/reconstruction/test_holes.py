@@ -1,7 +1,6 @@
 """Filled holes are as good as they say and never taken for measurements; other programs read what is written."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from lab.bench.reconstruction.scenes import cut_holes, scene
 
 @pytest.mark.parametrize("surface", ["free-form", "steps"])
 @pytest.mark.parametrize("size", [(1, 1), (2, 6), (1, 60)])
-def test_an_interpolated_point_errs_as_its_covariance_says(surface: str, size: tuple[int, int]) -> None:
+def test_an_interpolated_point_errs_as_its_covariance_says(surface: str, size: tuple[int, int]):
     made = scene(surface, "far", 0.0, 5)
     cut = cut_holes(made.depth.shape, size, 150, 6)
     filled = fill_holes(made.cloud(cut)).filled
@@ -29,7 +28,7 @@ def test_an_interpolated_point_errs_as_its_covariance_says(surface: str, size: t
     assert np.abs(filled.points[:, 0] - made.x[filled.lines, filled.rows]).max() < 1e-6
 
 
-def test_a_hole_wider_than_the_limit_stays_a_hole() -> None:
+def test_a_hole_wider_than_the_limit_stays_a_hole():
     made = scene("free-form", "far", 0.0, 1)
     cut = np.zeros(made.depth.shape, dtype=bool)
     around = np.s_[95:110, 95:125]
@@ -42,7 +41,7 @@ def test_a_hole_wider_than_the_limit_stays_a_hole() -> None:
         fill_holes(made.cloud(cut), -0.001)
 
 
-def test_nothing_is_filled_across_a_depth_edge_or_beyond_the_border() -> None:
+def test_nothing_is_filled_across_a_depth_edge_or_beyond_the_border():
     made = scene("free-form", "far", 0.0, 1)
     made.depth[150:] += 0.0005
     cut = np.zeros(made.depth.shape, dtype=bool)
@@ -53,7 +52,7 @@ def test_nothing_is_filled_across_a_depth_edge_or_beyond_the_border() -> None:
     assert not cut[filled.lines, filled.rows].any()
 
 
-def test_interpolated_points_are_never_measurements() -> None:
+def test_interpolated_points_are_never_measurements():
     made = scene("free-form", "far", 0.0, 1)
     cloud = made.cloud(cut_holes(made.depth.shape, (2, 6), 100, 1))
     whole = fill_holes(cloud)
@@ -75,7 +74,7 @@ def two_sweeps() -> Cloud:
     return merge(parts)
 
 
-def test_a_cloud_is_read_back_with_its_sweeps_its_sigma_and_its_flags(tmp_path: Path) -> None:
+def test_a_cloud_is_read_back_with_its_sweeps_its_sigma_and_its_flags(tmp_path):
     cloud = two_sweeps()
     count = write_cloud(tmp_path / "cloud.ply", cloud)
     stored = read_cloud(tmp_path / "cloud.ply")
@@ -94,7 +93,7 @@ def test_a_cloud_is_read_back_with_its_sweeps_its_sigma_and_its_flags(tmp_path: 
 @pytest.mark.parametrize(
     "content", [b"", b"ply\nend_header\n", b"ply\nelement vertex 3\nproperty float x\nend_header\n"]
 )
-def test_a_file_that_is_no_cloud_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_a_file_that_is_no_cloud_is_refused(tmp_path, content: bytes):
     (tmp_path / "cloud.ply").write_bytes(content)
     with pytest.raises(ConfigError, match="is no cloud of this program"):
         read_cloud(tmp_path / "cloud.ply")
@@ -102,7 +101,7 @@ def test_a_file_that_is_no_cloud_is_refused(tmp_path: Path, content: bytes) -> N
         read_cloud(tmp_path / "missing.ply")
 
 
-def test_a_mesh_lies_on_the_surface_faces_the_camera_and_spans_no_edge(tmp_path: Path) -> None:
+def test_a_mesh_lies_on_the_surface_faces_the_camera_and_spans_no_edge(tmp_path):
     made = scene("free-form", "far", 0.0, 1)
     made.depth[150:] += 0.003
     cloud = made.cloud(np.zeros(made.depth.shape, dtype=bool))

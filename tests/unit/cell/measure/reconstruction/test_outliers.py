@@ -11,9 +11,7 @@ from lab.bench.reconstruction.scenes import KINDS, scene
 
 
 @pytest.mark.parametrize("half", [0, 1])
-def test_a_half_that_could_not_be_judged_is_an_error_and_never_left_unfiltered(
-    monkeypatch: pytest.MonkeyPatch, half: int
-) -> None:
+def test_a_half_that_could_not_be_judged_is_an_error_and_never_left_unfiltered(monkeypatch, half: int):
     whole = outliers._judge
     middle = 20
 
@@ -28,7 +26,7 @@ def test_a_half_that_could_not_be_judged_is_an_error_and_never_left_unfiltered(
         find_outliers(depth, np.full_like(depth, 1e-5))
 
 
-def test_a_lone_point_is_an_outlier_and_an_empty_cloud_has_none() -> None:
+def test_a_lone_point_is_an_outlier_and_an_empty_cloud_has_none():
     depth = np.full((20, 20), np.nan)
     assert not find_outliers(depth, np.ones_like(depth)).any()
     depth[10, 10] = 0.1
@@ -38,7 +36,7 @@ def test_a_lone_point_is_an_outlier_and_an_empty_cloud_has_none() -> None:
 @pytest.mark.parametrize("surface", ["free-form", "steps"])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("share", [0.01, 0.05])
-def test_outliers_are_found_and_little_else(surface: str, kind: str, share: float) -> None:
+def test_outliers_are_found_and_little_else(surface: str, kind: str, share: float):
     made = scene(surface, kind, share, 8)
     found = find_outliers(made.depth, made.sigma)
     assert np.count_nonzero(found & made.bad) >= 0.99 * np.count_nonzero(made.bad)

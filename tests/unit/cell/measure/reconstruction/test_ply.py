@@ -1,7 +1,5 @@
 """Promises of `cell.measure.reconstruction.ply`."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -10,7 +8,7 @@ from cell.measure.reconstruction.ply import deviation_colours, read_cloud, write
 from drivers.errors import ConfigError
 
 
-def test_a_ply_is_read_back_by_another_library(tmp_path: Path) -> None:
+def test_a_ply_is_read_back_by_another_library(tmp_path):
     points = np.random.default_rng(1).normal(size=(12, 40, 3))
     points[3, 10:20] = np.nan
     colours = deviation_colours(points[:, :, 2], 1e-4)
@@ -27,12 +25,12 @@ def test_a_ply_is_read_back_by_another_library(tmp_path: Path) -> None:
     assert path.stat().st_size == len(header) + len("end_header\n") + count * (4 * 4 + 3)
 
 
-def test_a_ply_with_columns_of_different_length_is_refused(tmp_path: Path) -> None:
+def test_a_ply_with_columns_of_different_length_is_refused(tmp_path):
     with pytest.raises(ValueError, match="quality has 3 values for 2 points"):
         write_ply(tmp_path / "x.ply", np.zeros((2, 3)), quality=np.zeros(3))
 
 
-def test_deviation_colours_run_from_blue_over_green_to_red() -> None:
+def test_deviation_colours_run_from_blue_over_green_to_red():
     colours = deviation_colours([-1.0, -0.001, 0.0, 0.001, np.nan], 0.001)
     assert colours.tolist() == [[0, 0, 255], [0, 0, 255], [0, 255, 0], [255, 0, 0], [128, 128, 128]]
     with pytest.raises(ValueError, match="greater than 0"):
@@ -40,7 +38,7 @@ def test_deviation_colours_run_from_blue_over_green_to_red() -> None:
 
 
 @pytest.mark.parametrize("count", ["abcd", "-1", "3"])
-def test_a_cloud_whose_header_is_spoilt_is_refused(tmp_path: Path, count: str) -> None:
+def test_a_cloud_whose_header_is_spoilt_is_refused(tmp_path, count: str):
     names = ("x", "y", "z", "sigma", "line", "row", "sweep", "interpolated", "x")
     kinds = "".join(f"property float {name}\n" for name in names)
     (tmp_path / "cloud.ply").write_text(f"ply\nelement vertex {count}\n{kinds}end_header\n{'0000' * 27}")

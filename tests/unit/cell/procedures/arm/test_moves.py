@@ -19,7 +19,7 @@ from tests.unit.cell.procedures.drive.test_way import JOB, Site
 CONFIG = load_config(None)
 
 
-def test_the_arm_goes_the_same_way_at_a_share_of_its_speed_from_the_next_motion_on() -> None:
+def test_the_arm_goes_the_same_way_at_a_share_of_its_speed_from_the_next_motion_on():
     cell, pace = VirtualCell(CONFIG, 2, "nominal"), Pace()
     cell.devices.vehicle.brake()
     mover = Mover(cell.devices.arm, cell.clock, CONFIG, None, interlocks=cell.devices.interlocks, pace=pace)
@@ -58,12 +58,12 @@ def mover_with(size: tuple[float, float, float] | None) -> Mover:
 
 
 @pytest.mark.parametrize("size", [None, WIDE])
-def test_the_gate_knows_the_part_that_a_job_has_in_the_claw(size: tuple[float, float, float] | None) -> None:
+def test_the_gate_knows_the_part_that_a_job_has_in_the_claw(size: tuple[float, float, float] | None):
     known = mover_with(size)._interlocks.situation.part
     assert [body.size for body in known] == ([] if size is None else [size])
 
 
-def test_wherever_the_arm_stands_it_comes_to_a_pose_with_the_same_joints() -> None:
+def test_wherever_the_arm_stands_it_comes_to_a_pose_with_the_same_joints():
     """But for whole turns, of which it makes the fewest: the last joint's is spared from one turn further on."""
     mover = mover_with(None)
     pose = drawn_interim_view(CONFIG).base_from_flange
@@ -83,7 +83,7 @@ def test_wherever_the_arm_stands_it_comes_to_a_pose_with_the_same_joints() -> No
     assert mover.joints == pytest.approx(turned, abs=1e-3)
 
 
-def test_between_jobs_the_arm_rests_where_the_next_looks_first_or_else_at_home() -> None:
+def test_between_jobs_the_arm_rests_where_the_next_looks_first_or_else_at_home():
     mover = mover_with(None)
     mover.fold()
     assert mover.joints == pytest.approx(HOME, abs=1e-3)
@@ -97,7 +97,7 @@ def test_between_jobs_the_arm_rests_where_the_next_looks_first_or_else_at_home()
     assert np.linalg.norm(mover.kinematics.fk(mover.joints).actInv(rest).translation) < 1e-4
 
 
-def test_with_a_part_that_has_no_room_there_the_arm_rests_at_home() -> None:
+def test_with_a_part_that_has_no_room_there_the_arm_rests_at_home():
     view = drawn_interim_view(CONFIG).base_from_flange
     for mover, rests in ((mover_with((0.07, 0.036, 0.02)), True), (mover_with(WIDE), False)):
         mover.rest_at(view)
@@ -107,7 +107,7 @@ def test_with_a_part_that_has_no_room_there_the_arm_rests_at_home() -> None:
         assert (np.abs(mover.joints - HOME).max() > 0.5) == rests
 
 
-def test_a_view_is_taken_with_the_calibrations_joints_or_not_at_all() -> None:
+def test_a_view_is_taken_with_the_calibrations_joints_or_not_at_all():
     view = drawn_interim_view(CONFIG).base_from_flange
     mover = mover_with(None)
     mover.to_view(view)
@@ -116,7 +116,7 @@ def test_a_view_is_taken_with_the_calibrations_joints_or_not_at_all() -> None:
         mover_with(WIDE).to_view(view)
 
 
-def test_the_vehicle_drives_at_a_share_of_the_jobs_speed() -> None:
+def test_the_vehicle_drives_at_a_share_of_the_jobs_speed():
     def fastest(share: float) -> float:
         site, pace, speeds = Site(), Pace(), [0.0]
         pace.share = share
@@ -129,14 +129,14 @@ def test_the_vehicle_drives_at_a_share_of_the_jobs_speed() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.9 * LEAST, 1.01, float("nan"), True, "fast", None])
-def test_what_is_no_pace_is_refused_with_what_is_allowed(share: object) -> None:
+def test_what_is_no_pace_is_refused_with_what_is_allowed(share: object):
     pace = Pace()
     with pytest.raises(ConfigError, match=r"allowed are 0\.25 to 1"):
         pace.share = share
     assert pace.share == 1.0
 
 
-def test_a_cell_is_slowed_from_outside_while_it_works() -> None:
+def test_a_cell_is_slowed_from_outside_while_it_works():
     with Cell.open(sim="all", clock="virtual", seed=4) as cell:
         assert cell.pace == 1.0
         cell.pace = 0.3
@@ -145,7 +145,7 @@ def test_a_cell_is_slowed_from_outside_while_it_works() -> None:
             cell.pace = 2.0
 
 
-def test_parts_of_other_items_are_kept_clear_of_but_in_the_items_own_place() -> None:
+def test_parts_of_other_items_are_kept_clear_of_but_in_the_items_own_place():
     tray, new = load_job("tray4#2")[0], load_job("swap#2")[0]
     place = from_parts((1.0, 0.0, 0.6))
     nested, placed = nested_parts(tray), placed_parts(tray, place)

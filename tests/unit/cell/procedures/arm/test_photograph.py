@@ -56,7 +56,7 @@ def photographed(cell: VirtualCell, count: int = 1, **limits: float) -> BoardFix
     )
 
 
-def test_the_board_is_where_it_truly_is_and_more_photographs_know_it_better(cell: VirtualCell) -> None:
+def test_the_board_is_where_it_truly_is_and_more_photographs_know_it_better(cell: VirtualCell):
     once, often = photographed(cell), photographed(cell, 4)
     truth = from_matrix(inverse(cell.world.world_from_base(cell.clock.now())) @ cell.world.scene.world_from_board)
     for fix in (once, often):
@@ -65,7 +65,7 @@ def test_the_board_is_where_it_truly_is_and_more_photographs_know_it_better(cell
     assert np.trace(once.covariance) / np.trace(often.covariance) == pytest.approx(4.0, rel=0.3)
 
 
-def test_a_board_that_is_seen_too_obliquely_or_not_as_it_is_is_refused_and_shown(cell: VirtualCell) -> None:
+def test_a_board_that_is_seen_too_obliquely_or_not_as_it_is_is_refused_and_shown(cell: VirtualCell):
     fix = photographed(cell)
     for limit, words in (
         ({"max_obliquity": 0.9 * fix.obliquity}, "deg from square, allowed up to"),
@@ -80,6 +80,6 @@ def test_a_board_that_is_seen_too_obliquely_or_not_as_it_is_is_refused_and_shown
     photographed(cell, max_obliquity=1.1 * fix.obliquity, max_residual=2.0 * fix.residual_px)
 
 
-def test_a_way_back_begins_where_the_sweep_ends() -> None:
+def test_a_way_back_begins_where_the_sweep_ends():
     plan = ScanPlan(from_parts((0.1, 0.0, 0.0)), from_parts((0.2, 0.0, 0.0)), 0.018, 0.082)
     assert plan.back == ScanPlan(plan.base_from_flange_end, plan.base_from_flange, 0.082, 0.018) and plan.back != plan

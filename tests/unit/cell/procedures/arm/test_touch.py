@@ -1,7 +1,6 @@
 """First touch: where a force begins, by closed forms; and a laser that turned unseen, on the simulated cell."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -45,9 +44,7 @@ def still() -> ArmState:
 
 @pytest.mark.parametrize("grows", [1.0, 1.5, 2.0])
 @pytest.mark.parametrize("height", [0.2e-3, -0.15e-3])
-def test_the_touch_is_where_the_force_begins_flat_on_an_edge_or_round(
-    height: float, grows: float, still: ArmState
-) -> None:
+def test_the_touch_is_where_the_force_begins_flat_on_an_edge_or_round(height: float, grows: float, still: ArmState):
     """A flat contact presses back in proportion, an edge with the square, round bodies (Hertz) with the power 3/2."""
     forces = 8.0 * (np.maximum(0.0, height - HEIGHTS) / 0.4e-3) ** grows
     found = [felt_touch(states(forces, still, seed), ORIGIN, UP) for seed in range(8)]
@@ -58,7 +55,7 @@ def test_the_touch_is_where_the_force_begins_flat_on_an_edge_or_round(
 
 
 @pytest.mark.parametrize("follows", [0.9, 0.97])
-def test_force_errors_that_last_are_stated(follows: float, still: ArmState) -> None:
+def test_force_errors_that_last_are_stated(follows: float, still: ArmState):
     """Friction and filters hold an error over many readings: taken for white noise, it was off by 5 deviations."""
     off = []
     for seed in range(12):
@@ -74,18 +71,18 @@ def test_force_errors_that_last_are_stated(follows: float, still: ArmState) -> N
     assert np.sqrt(np.mean(np.square(off))) < 1.5 and np.abs(off).max() < 3.5
 
 
-def test_an_arm_that_tells_next_to_nothing_is_no_witness(still: ArmState) -> None:
+def test_an_arm_that_tells_next_to_nothing_is_no_witness(still: ArmState):
     assert felt_touch(states(np.zeros(300), still)[:10], ORIGIN, UP) is None
 
 
-def test_a_touch_is_noted_before_it_is_refused() -> None:
+def test_a_touch_is_noted_before_it_is_refused():
     check = TouchCheck(TouchHeight(-0.3e-3, 0.0), TouchHeight(0.0, 0.1e-3))
     check.require()
     assert "0.300 mm lower than the scan says" in check.notes[0]
     assert TouchCheck(TouchHeight(-0.2e-3, 0.0), TouchHeight(0.0, 0.1e-3)).notes == ()
 
 
-def test_a_part_that_may_be_tilted_is_expected_to_touch_early(placed_pot: JobRecord) -> None:
+def test_a_part_that_may_be_tilted_is_expected_to_touch_early(placed_pot: JobRecord):
     pose, known = placed_pot.results["invert_pose"], replaced_grasp(1e-6, 1e-6)
     tilted = replaced_grasp(1e-6, 3e-3)
     steady, early = (expected_touch(job, NOMINAL, pose, placed_pot.placing) for job in (known, tilted))
@@ -95,9 +92,7 @@ def test_a_part_that_may_be_tilted_is_expected_to_touch_early(placed_pot: JobRec
     assert early.sigma > steady.sigma
 
 
-def test_a_laser_that_turned_unseen_is_caught_when_the_part_touches(
-    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_laser_that_turned_unseen_is_caught_when_the_part_touches(placed_pot: JobRecord, tmp_path, monkeypatch):
     """One milliradian, no plate to see it on, and a job that knows its grasp as this level's claw holds it."""
     blind = replace(placed_pot.calibration, scan=replace(placed_pot.calibration.scan, witness=None))
     monkeypatch.setattr(levels, "ALONE", replace(levels.ALONE, laser_pointing=150e-6))
@@ -116,7 +111,7 @@ def replaced_grasp(sigma: float, angle: float) -> Job:
     return JOB.model_copy(update={"grasp": JOB.grasp.model_copy(update={"sigma": sigma, "sigma_angle": angle})})
 
 
-def test_a_part_that_is_put_down_aslant_touches_along_its_own_way() -> None:
+def test_a_part_that_is_put_down_aslant_touches_along_its_own_way():
     """On flat ground, on a way 40° off its normal, an error of the place is felt 1/cos 40° as large."""
     corners = 0.02 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     flat = NominalSurface(corners, [[0, 1, 2], [0, 2, 3]])

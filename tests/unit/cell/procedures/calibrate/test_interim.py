@@ -51,7 +51,7 @@ def untouched(placed_pot: JobRecord) -> tuple[InterimCheck, list[str]]:
 
 def test_a_cell_that_nobody_touched_passes_and_says_what_it_saw(
     placed_pot: JobRecord, untouched: tuple[InterimCheck, list[str]]
-) -> None:
+):
     found, kept = untouched
     assert not found.head.changed and found.notes == ()
     found.require()
@@ -67,7 +67,7 @@ def test_a_cell_that_nobody_touched_passes_and_says_what_it_saw(
     assert np.linalg.norm(rest.actInv(pose_of(placed_pot.at_end, "base_from_flange")).translation) < 1e-3
 
 
-def test_what_moves_the_place_too_far_refuses_with_the_number_and_the_next_step(placed_pot: JobRecord) -> None:
+def test_what_moves_the_place_too_far_refuses_with_the_number_and_the_next_step(placed_pot: JobRecord):
     found, kept = looked(placed_pot, SHIFTS["last joint's zero, 4 mrad"].put_in)
     assert found.head.changed and found.matters and len(kept) == found.head.looks == 1
     with pytest.raises(RefusedError, match=r"has moved: by .* allowed are 0\.18 mm.*then run `cell calibrate`") as met:
@@ -78,14 +78,14 @@ def test_what_moves_the_place_too_far_refuses_with_the_number_and_the_next_step(
     assert f"{1e3 * found.effect:.2f} mm off, at most {1e3 * found.at_most:.2f} mm" in str(met.value)
 
 
-def test_a_lens_that_moved_looks_like_a_head_that_moved(placed_pot: JobRecord) -> None:
+def test_a_lens_that_moved_looks_like_a_head_that_moved(placed_pot: JobRecord):
     found, _ = looked(placed_pot, SHIFTS["scan camera's middle, 1.5 px"].put_in)
     assert found.head.changed
 
 
 def test_what_may_be_chance_is_looked_at_again_and_all_looks_count(
     placed_pot: JobRecord, untouched: tuple[InterimCheck, list[str]]
-) -> None:
+):
     found = [looked(placed_pot, SHIFTS[f"scan head, .1 mm along {axis}"].put_in)[0].head for axis in "xyz"]
     assert all(head.changed or not head.suspicious or head.looks == LOOKS for head in found)
     seen = [*found, untouched[0].head, looked(placed_pot, SHIFTS["fine board, .2 mm"].put_in)[0].head]
@@ -93,7 +93,7 @@ def test_what_may_be_chance_is_looked_at_again_and_all_looks_count(
     assert once and more and all((many < 0.8 * once[0]).all() for many in more)
 
 
-def test_a_job_whose_head_has_moved_ends_before_the_vehicle_drives(placed_pot: JobRecord) -> None:
+def test_a_job_whose_head_has_moved_ends_before_the_vehicle_drives(placed_pot: JobRecord):
     nominal = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)
     moved = SHIFTS["last joint's zero, 4 mrad"].put_in
     ended = run_whole_job(CONFIG, JOB, nominal, placed_pot.seed, "nominal", calibrated=placed_pot, changed=moved)
@@ -113,16 +113,14 @@ def arrived(
     return site.do("drive_to_target"), notes
 
 
-def test_a_cell_that_does_not_want_it_is_not_looked_at(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_a_cell_that_does_not_want_it_is_not_looked_at(placed_pot: JobRecord, tmp_path):
     unlooked = CONFIG.calibration.model_copy(update={"each_job": False})
     config = CONFIG.model_copy(update={"calibration": unlooked})
     arrival, _ = arrived(placed_pot, tmp_path, placed_pot.calibration, config)
     assert arrival.head is None and "interim" not in arrival.summary()
 
 
-def test_a_calibration_of_an_older_program_is_not_looked_at_and_the_job_says_so(
-    placed_pot: JobRecord, tmp_path: Path
-) -> None:
+def test_a_calibration_of_an_older_program_is_not_looked_at_and_the_job_says_so(placed_pot: JobRecord, tmp_path):
     made = placed_pot.calibration
     old = replace(made, scan=replace(made.scan, reference=None))
     arrival, notes = arrived(placed_pot, tmp_path, old)
@@ -132,7 +130,7 @@ def test_a_calibration_of_an_older_program_is_not_looked_at_and_the_job_says_so(
     )
 
 
-def test_a_board_that_is_covered_is_refused_with_what_to_do(placed_pot: JobRecord) -> None:
+def test_a_board_that_is_covered_is_refused_with_what_to_do(placed_pot: JobRecord):
     def away(cell: VirtualCell) -> None:
         moved = cell.world.scene.base_from_fine_board.copy()
         moved[:3, 3] += 0.2
@@ -148,7 +146,7 @@ def seen(**changes: object) -> InterimCheck:
     return replace(made, **changes)  # type: ignore[arg-type]
 
 
-def test_a_change_that_does_little_is_told_and_the_job_goes_on() -> None:
+def test_a_change_that_does_little_is_told_and_the_job_goes_on():
     found = seen()
     found.require()
     (note,) = found.notes
@@ -157,24 +155,24 @@ def test_a_change_that_does_little_is_told_and_the_job_goes_on() -> None:
     assert seen(head=replace(found.head, chance=0.5)).notes == ()
 
 
-def test_what_may_do_too_much_counts_and_only_if_it_is_no_chance() -> None:
+def test_what_may_do_too_much_counts_and_only_if_it_is_no_chance():
     assert seen(at_most=0.181e-3).matters and not seen(at_most=0.179e-3).matters
     assert not seen(at_most=0.5e-3, head=replace(seen().head, chance=0.01)).matters
 
 
-def test_a_look_that_leaves_too_much_open_says_so() -> None:
+def test_a_look_that_leaves_too_much_open_says_so():
     (note,) = seen(at_most=0.25e-3, head=replace(seen().head, chance=0.5)).notes
     assert "what it leaves open may put the place 0.25 mm off (allowed 0.18 mm). `cell calibrate verify`" in note
 
 
-def test_pictures_that_fit_badly_are_refused() -> None:
+def test_pictures_that_fit_badly_are_refused():
     with pytest.raises(
         RefusedError, match=r"fits its picture 1\.7 times worse .* allowed 1\.6 times.*calibrate verify"
     ):
         seen(head=replace(seen().head, dots=1.7, chance=0.9)).require()
 
 
-def test_its_figures_are_those_of_the_head() -> None:
+def test_its_figures_are_those_of_the_head():
     assert seen().summary() == {
         "shift_mm": [0.1, 0.0, 0.0], "turn_mrad": [0.0, 0.0, 1.0], "sigma_mm": [0.01] * 3, "sigma_mrad": [0.01] * 3,
         "place_mm": 0.1, "place_at_most_mm": 0.15, "place_allowed_mm": 0.18, "off_mm": [0.1, 0.0, 0.0],
@@ -183,7 +181,7 @@ def test_its_figures_are_those_of_the_head() -> None:
 
 
 @pytest.mark.parametrize(("axis", "lever"), [(0, JOB.scan.stand_off), (2, 0.05)])
-def test_a_turn_moves_the_place_by_its_distance(placed_pot: JobRecord, axis: int, lever: float) -> None:
+def test_a_turn_moves_the_place_by_its_distance(placed_pot: JobRecord, axis: int, lever: float):
     """Of 10 mrad about the camera's x, 130 mm; about its axis, the 50 mm that the rail stands out in mid-sweep."""
     turn = 10e-3 * np.eye(3)[axis]
 
@@ -199,6 +197,6 @@ def test_a_turn_moves_the_place_by_its_distance(placed_pot: JobRecord, axis: int
 
 
 @pytest.mark.campaign
-def test_every_planted_shift_is_found_in_a_cell(placed_pot: JobRecord) -> None:
+def test_every_planted_shift_is_found_in_a_cell(placed_pot: JobRecord):
     missed = [name for name, each in SHIFTS.items() if not looked(placed_pot, each.put_in)[0].head.changed]
     assert len(missed) <= 2

@@ -48,7 +48,7 @@ def cell() -> tuple[VirtualCell, PlateLine, Callable[[PlateLine], Slip]]:
     return cell, before, lambda now: slip_since(before, now, camera, plane, scene.rail_direction)
 
 
-def test_the_edge_is_where_the_world_has_it(cell) -> None:
+def test_the_edge_is_where_the_world_has_it(cell):
     world, before = cell[0].world, cell[1]
     world.rail.carriage(0.0)
     scene, plate = world.scene, world.scene.drawing.cell.witness
@@ -71,9 +71,7 @@ def slipped(virtual: VirtualCell, moved: tuple[float, float], monkeypatch: pytes
 
 
 @pytest.mark.parametrize("moved", [(0.0, 0.0), (0.12e-3, 0.0), (-0.1e-3, 0.15e-3)])
-def test_a_head_that_has_slipped_is_seen_to_hundredths(
-    cell, moved: tuple[float, float], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_head_that_has_slipped_is_seen_to_hundredths(cell, moved: tuple[float, float], monkeypatch):
     virtual, before, since = cell
     slipped(virtual, moved, monkeypatch)
     slip = since(looked(virtual, before))
@@ -81,14 +79,14 @@ def test_a_head_that_has_slipped_is_seen_to_hundredths(
     assert abs(slip.lag) < 3e-3 and not slip.hidden
 
 
-def test_a_head_that_has_slipped_far_is_refused_with_the_next_step(cell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_head_that_has_slipped_far_is_refused_with_the_next_step(cell, monkeypatch):
     virtual, before, _ = cell
     slipped(virtual, (1e-3, 0.0), monkeypatch)
     with pytest.raises(RefusedError, match=r"slipped.*cell calibrate"):
         looked(virtual, before)
 
 
-def test_auto_gain_is_no_slip(cell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_auto_gain_is_no_slip(cell, monkeypatch):
     virtual, before, _ = cell
     render = virtual.world.render
 
@@ -101,7 +99,7 @@ def test_auto_gain_is_no_slip(cell, monkeypatch: pytest.MonkeyPatch) -> None:
         looked(virtual, before)
 
 
-def test_a_laser_that_has_turned_is_no_slip(cell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_laser_that_has_turned_is_no_slip(cell, monkeypatch):
     virtual, before, since = cell
     world, scene = virtual.world, virtual.world.scene
     drifted = replace(scene, workshop=replace(scene.workshop, pointing=0.4e-3))
@@ -110,7 +108,7 @@ def test_a_laser_that_has_turned_is_no_slip(cell, monkeypatch: pytest.MonkeyPatc
     assert since(looked(virtual, before)).size < 2.5e-5
 
 
-def test_pictures_that_are_paired_one_off_are_seen(cell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_that_are_paired_one_off_are_seen(cell, monkeypatch):
     virtual, before, since = cell
     camera = virtual.scan_camera.model
     monkeypatch.setattr(camera, "spec", replace(camera.spec, latency=camera.spec.latency + 1 / 30))
@@ -121,7 +119,7 @@ def test_pictures_that_are_paired_one_off_are_seen(cell, monkeypatch: pytest.Mon
         slip.require()
 
 
-def test_a_laser_that_flickers_is_named_before_it_looks_like_a_slip(cell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_laser_that_flickers_is_named_before_it_looks_like_a_slip(cell, monkeypatch):
     cameras, clock = cell[0].world._cameras, cell[0].devices.clock
     laser, begun = cameras.laser, clock.now()
 
@@ -135,7 +133,7 @@ def test_a_laser_that_flickers_is_named_before_it_looks_like_a_slip(cell, monkey
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4, 0.7])
-def test_a_laser_that_goes_out_or_dims_for_one_passage_is_named(share: float) -> None:
+def test_a_laser_that_goes_out_or_dims_for_one_passage_is_named(share: float):
     places = np.linspace(0.0, 1.2e-3, 18)
     light = 19.0 / (1.0 + np.exp((places - 0.6e-3) / 4e-5)) + np.random.default_rng(0).normal(0.0, 0.1, 18)
     whole, dim = (places, light, light), (places, light, light.copy())
@@ -146,7 +144,7 @@ def test_a_laser_that_goes_out_or_dims_for_one_passage_is_named(share: float) ->
             reference_plate._require_steady(passages, 1.0)
 
 
-def test_pictures_lost_at_the_edge_make_neither_a_lag_nor_a_slip(cell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_lost_at_the_edge_make_neither_a_lag_nor_a_slip(cell, monkeypatch):
     virtual, before, since = cell
     camera, seen, light = virtual.scan_camera.model, [], reference_plate._light
 
@@ -174,7 +172,7 @@ def test_pictures_lost_at_the_edge_make_neither_a_lag_nor_a_slip(cell, monkeypat
 
 
 @pytest.mark.parametrize("most_hz", [16.0, 10.0])
-def test_a_slower_camera_sees_the_edge_at_the_same_place(cell, most_hz: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slower_camera_sees_the_edge_at_the_same_place(cell, most_hz: float, monkeypatch):
     virtual, before, _ = cell
     camera = virtual.scan_camera.model
     monkeypatch.setattr(camera, "spec", replace(camera.spec, frame_rate_max=most_hz))
@@ -182,7 +180,7 @@ def test_a_slower_camera_sees_the_edge_at_the_same_place(cell, most_hz: float, m
     assert edge.place == pytest.approx(before.edge.place, abs=1e-5)
 
 
-def test_an_end_of_the_line_that_is_covered_is_no_shift(cell) -> None:
+def test_an_end_of_the_line_that_is_covered_is_no_shift(cell):
     _, before, since = cell
     columns = before.columns.copy()
     columns[before.rows[-25:]] = np.nan
@@ -191,7 +189,7 @@ def test_an_end_of_the_line_that_is_covered_is_no_shift(cell) -> None:
 
 
 @pytest.mark.parametrize(("low", "high"), [(-9e-3, 9e-3), (-20e-3, 9e-3), (-9e-3, 20e-3), (-20e-3, 20e-3)])
-def test_a_slip_across_is_told_only_where_the_picture_holds_both_ends_of_the_line(low: float, high: float) -> None:
+def test_a_slip_across_is_told_only_where_the_picture_holds_both_ends_of_the_line(low: float, high: float):
     camera = CameraModel(640, 480, 1667.0, 1667.0, 319.5, 239.5)
     across = (np.arange(480) - camera.cy) / camera.fy * 0.085
 
@@ -208,20 +206,20 @@ def test_a_slip_across_is_told_only_where_the_picture_holds_both_ends_of_the_lin
     assert slip.hidden == ("not in the picture" in slip.notes[-1])
 
 
-def test_a_job_says_what_its_plate_does_not_show(cell) -> None:
+def test_a_job_says_what_its_plate_does_not_show(cell):
     whole = cell[1]
     assert unwatched(whole) == ()
     assert "no edge" in " ".join(unwatched(replace(whole, edge=None)))
     assert "laser.witness" in " ".join(unwatched(None))
 
 
-def test_it_is_kept_with_the_calibration(cell) -> None:
+def test_it_is_kept_with_the_calibration(cell):
     before = cell[1]
     again = PlateLine.read(before.as_dict())
     assert again is not None and again.edge == before.edge
 
 
-def test_a_rail_that_lost_so_many_steps_that_the_plate_is_out_of_sight_is_told_as_such() -> None:
+def test_a_rail_that_lost_so_many_steps_that_the_plate_is_out_of_sight_is_told_as_such():
     cell = VirtualCell(CONFIG, 3, "nominal")
     cell.devices.vehicle.brake()
     cell.devices.rail.home().wait(60.0)

@@ -1,7 +1,5 @@
 """How good a calibration is: what its report says of noise and of the place, and draws."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -34,20 +32,20 @@ def examined() -> Examination:
     return examine(solved, seen, CONFIG, "pot")
 
 
-def test_the_residuals_speak_of_the_noise_that_there_is(examined: Examination) -> None:
+def test_the_residuals_speak_of_the_noise_that_there_is(examined: Examination):
     noise = examined.summary["noise_found"]
     assert (noise["dots"], noise["chi2_per_dof"]) == pytest.approx((1.0, 1.0), abs=0.3)
     assert all(not check["suspect"] for check in examined.summary["checks"] if "suspect" in check)
 
 
-def test_what_limits_the_place_is_no_more_than_all_of_it_and_what_is_added_betters_it(examined: Examination) -> None:
+def test_what_limits_the_place_is_no_more_than_all_of_it_and_what_is_added_betters_it(examined: Examination):
     influence, advice = examined.summary["influence"], examined.summary["advice"]
     assert influence["points"] == 45
     assert all(row["if_known_mm"] <= influence["total_mm"] * (1 + 1e-9) for row in influence["parameters"])
     assert all(row["then_mm"] <= influence["total_mm"] * (1 + 1e-9) for row in advice)
 
 
-def test_three_pictures_are_drawn(examined: Examination, tmp_path: Path) -> None:
+def test_three_pictures_are_drawn(examined: Examination, tmp_path):
     for path in examined.draw(tmp_path / "pictures"):
         picture = cv2.imread(str(path))
         assert min(picture.shape[:2]) > 600 and picture.std() > 10

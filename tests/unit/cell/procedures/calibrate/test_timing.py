@@ -21,13 +21,13 @@ from sim_backends.world import scene
 CONFIG = load_config(None)
 
 
-def test_a_calibration_has_looked_at_the_shutter(placed_pot: JobRecord) -> None:
+def test_a_calibration_has_looked_at_the_shutter(placed_pot: JobRecord):
     shutter = placed_pot.calibration.scan.shutter
     assert abs(shutter.readout) < 5 * shutter.sigma < 0.25e-3
     assert times_known(placed_pot.calibration.scan, CONFIG) == (None, ())
 
 
-def test_a_calibration_of_a_cell_with_a_rolling_shutter_is_refused(placed_pot: JobRecord) -> None:
+def test_a_calibration_of_a_cell_with_a_rolling_shutter_is_refused(placed_pot: JobRecord):
     made = placed_pot.calibration
     cell = VirtualCell(CONFIG, 2, "nominal+rolling_shutter")
     cell.devices.vehicle.brake()
@@ -36,7 +36,7 @@ def test_a_calibration_of_a_cell_with_a_rolling_shutter_is_refused(placed_pot: J
         look_at_shutter(CONFIG, cell.devices, mover, made, lambda: None, lambda what, frame: None)
 
 
-def test_a_shutter_that_could_not_be_looked_at_is_a_note_and_the_calibration_holds(placed_pot: JobRecord) -> None:
+def test_a_shutter_that_could_not_be_looked_at_is_a_note_and_the_calibration_holds(placed_pot: JobRecord):
     made = placed_pot.calibration
     spoilt = replace(made, scan=replace(made.scan, shutter=None))
     short = CONFIG.model_copy(update={"rail": CONFIG.rail.model_copy(update={"travel": (0.04, 0.055)})})
@@ -57,7 +57,7 @@ def measured(made: CellCalibration, seed: int, level: str) -> StampTiming:
 
 
 @pytest.mark.campaign
-def test_ten_simulated_cells_know_their_lateness(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ten_simulated_cells_know_their_lateness(monkeypatch):
     """Two milliseconds late each; the eleventh has a rolling shutter."""
     drawn = scene._clock
     monkeypatch.setattr(scene, "_clock", lambda *given: replace(drawn(*given), latency=2e-3))

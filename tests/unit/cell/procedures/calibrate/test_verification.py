@@ -33,7 +33,7 @@ TURN = ConfirmedTurn(plate=0.50e-3, turn=0.54e-3, sigma=0.03e-3, made=1e9)
 
 
 @pytest.mark.parametrize("further", [0.0, 0.08e-3, -0.05e-3])
-def test_what_the_board_has_confirmed_is_not_uncertain_any_more(further: float) -> None:
+def test_what_the_board_has_confirmed_is_not_uncertain_any_more(further: float):
     seen = Pointing(TURN.plate + further, PLATE_RAD)
     alone, known = seen.stated, TURN.since(seen).stated
     assert alone.sigma > abs(seen.turn)
@@ -41,13 +41,13 @@ def test_what_the_board_has_confirmed_is_not_uncertain_any_more(further: float) 
     assert (known.sigma, known.open) == (pytest.approx(np.hypot(PLATE_RAD, TURN.sigma)), 0.0)
 
 
-def test_a_plate_that_is_knocked_after_it_was_confirmed_is_not_believed() -> None:
+def test_a_plate_that_is_knocked_after_it_was_confirmed_is_not_believed():
     known = TURN.since(Pointing(TURN.plate + 0.4e-3, PLATE_RAD)).stated
     assert known.sigma > 0.4e-3
     assert "of which +0.540 mrad were seen on a board" in known.words
 
 
-def test_it_is_stored_and_what_is_no_turn_is_not_read() -> None:
+def test_it_is_stored_and_what_is_no_turn_is_not_read():
     assert ConfirmedTurn.read(json.loads(json.dumps(vars(TURN)))) == TURN
     assert ConfirmedTurn.read(None) is None
     for spoilt in ({"sigma": 0.0}, {"turn": float("nan")}):
@@ -69,7 +69,7 @@ def collected(
 
 
 @pytest.fixture
-def turned(placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch) -> tuple[Verification, float]:
+def turned(placed_pot: JobRecord, monkeypatch) -> tuple[Verification, float]:
     """A verification of a cell whose laser has turned by half a milliradian, and by how much, rad."""
     monkeypatch.setattr(levels, "ALONE", replace(levels.ALONE, laser_pointing=80e-6))
     true = abs(draw(placed_pot.seed, LEVEL).workshop.pointing) * (1 - np.exp(-STOOD_S / levels.WARMING_S))
@@ -77,7 +77,7 @@ def turned(placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch) -> tuple[Veri
     return Verification.of(placed_pot.calibration, JOB, seen), float(true)
 
 
-def test_a_short_and_slow_rail_has_room_to_gain_its_speed(placed_pot: JobRecord) -> None:
+def test_a_short_and_slow_rail_has_room_to_gain_its_speed(placed_pot: JobRecord):
     rail = CONFIG.rail.model_copy(update={"travel": (0.0, 0.04), "max_speed": 0.01, "acceleration": 0.02})
     checks = iter([None, None])
 
@@ -91,7 +91,7 @@ def test_a_short_and_slow_rail_has_room_to_gain_its_speed(placed_pot: JobRecord)
 
 def test_a_verification_keeps_the_turn_for_jobs_and_takes_it_back_when_the_plate_was_knocked(
     turned: tuple[Verification, float], placed_pot: JobRecord, here: Path
-) -> None:
+):
     found, true = turned
     folder, path = here / "calibrations", here / "calibrations" / f"{placed_pot.calibration.name}.json"
     save_calibration(placed_pot.calibration, path)
@@ -113,15 +113,15 @@ def test_a_verification_keeps_the_turn_for_jobs_and_takes_it_back_when_the_plate
 
 
 @pytest.mark.usefixtures("here")
-def test_a_calibration_that_is_not_there_is_not_shown() -> None:
+def test_a_calibration_that_is_not_there_is_not_shown():
     assert json.loads(CliRunner().invoke(app, ["calibrate", "list", "--json"]).stdout) == []
     assert CliRunner().invoke(app, ["calibrate", "show", "nobody's"]).exit_code != 0
 
 
 @pytest.mark.campaign
 def test_a_job_that_was_refused_for_the_turn_goes_on_once_it_is_confirmed(
-    turned: tuple[Verification, float], placed_pot: JobRecord, tmp_path: Path
-) -> None:
+    turned: tuple[Verification, float], placed_pot: JobRecord, tmp_path
+):
     nominal = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)
 
     def run(record: JobRecord) -> JobRecord:

@@ -16,7 +16,7 @@ from drivers.errors import DeviceFault
 from drivers.interfaces import VehicleState
 
 
-def test_planar_poses_are_a_group() -> None:
+def test_planar_poses_are_a_group():
     a, b = Planar(1.0, -2.0, 0.7), Planar(-0.3, 0.4, 2.9)
     identity = a * a.inverse()
     assert (identity.x, identity.y, identity.yaw) == pytest.approx((0, 0, 0), abs=1e-12)
@@ -25,13 +25,13 @@ def test_planar_poses_are_a_group() -> None:
 
 
 @pytest.mark.parametrize("angle", [0.0, 3.0, -3.0, 7.0, -7.0, 100.0])
-def test_wrapped_angles_are_the_same_direction(angle: float) -> None:
+def test_wrapped_angles_are_the_same_direction(angle: float):
     assert abs(wrap(angle)) <= math.pi
     assert math.cos(wrap(angle)) == pytest.approx(math.cos(angle))
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_the_line_law_arrives_within_a_centimetre_and_a_degree(seed: int) -> None:
+def test_the_line_law_arrives_within_a_centimetre_and_a_degree(seed: int):
     """A vehicle with limited acceleration, controlled at 25 Hz, from up to 40 mm and 2° beside an 0.8 m line."""
     rng = np.random.default_rng(seed)
     pose = Planar(-0.8, rng.uniform(-0.04, 0.04), math.radians(rng.uniform(-2, 2)))
@@ -48,7 +48,7 @@ def test_the_line_law_arrives_within_a_centimetre_and_a_degree(seed: int) -> Non
     assert speed < 0.05
 
 
-def test_backwards_the_law_steers_the_other_way() -> None:
+def test_backwards_the_law_steers_the_other_way():
     ahead = line_command(Planar(-0.5, 0.02, 0.0), Planar(0, 0, 0), 0.3)
     behind = line_command(Planar(0.5, 0.02, 0.0), Planar(0, 0, 0), 0.3)
     assert ahead[0] > 0 > behind[0]
@@ -92,12 +92,12 @@ WAYS = [partial(straight, 0.3), partial(straight, -0.1), round_about]
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_at_the_end_of_a_way_it_stands(cell: VirtualCell, way) -> None:
+def test_at_the_end_of_a_way_it_stands(cell: VirtualCell, way):
     way(cell, RelativeOdometry(cell.vehicle), lambda: None)
     assert speed(cell) == pytest.approx(0.0, abs=1e-3)
 
 
-def test_what_does_not_come_along_is_given_up_and_left_for_a_person(cell: VirtualCell) -> None:
+def test_what_does_not_come_along_is_given_up_and_left_for_a_person(cell: VirtualCell):
     begun = cell.clock.now()
     with pytest.raises(DeviceFault, match="in time") as caught:
         # Odometry of wheels that do not come along.
@@ -112,7 +112,7 @@ class Enough(Exception):
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_who_wants_the_end_of_a_way_is_asked_all_along(cell: VirtualCell, way) -> None:
+def test_who_wants_the_end_of_a_way_is_asked_all_along(cell: VirtualCell, way):
     wanted = cell.clock.now() + 0.4
 
     def check() -> None:
@@ -149,7 +149,7 @@ class LateVehicle:
 
 
 @pytest.mark.parametrize("seed", [2, 5])
-def test_a_vehicle_stands_where_it_may_have_arrived_until_newer_feedback_tells(seed: int) -> None:
+def test_a_vehicle_stands_where_it_may_have_arrived_until_newer_feedback_tells(seed: int):
     cell = VirtualCell(load_config(None), seed)
     vehicle = LateVehicle(cell, 0.45, 0.6, looks_new=False)
     cell.vehicle.enable()

@@ -74,7 +74,7 @@ def site() -> Site:
     return Site()
 
 
-def test_a_word_about_the_start_of_one_job_does_not_hold_for_the_next(site: Site) -> None:
+def test_a_word_about_the_start_of_one_job_does_not_hold_for_the_next(site: Site):
     site.whereabouts.say_at_start()
     site.whereabouts.forget_word()
     site.whereabouts.enter(JOB)
@@ -86,9 +86,7 @@ def test_a_word_about_the_start_of_one_job_does_not_hold_for_the_next(site: Site
 
 
 @pytest.mark.parametrize("seen", [True, False])
-def test_the_anchor_is_lost_with_an_interruption_and_says_which(
-    site: Site, seen: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_anchor_is_lost_with_an_interruption_and_says_which(site: Site, seen: bool, monkeypatch):
     site.whereabouts.enter(JOB)
     site.whereabouts.see(Planar.of(JOB.approach.start.se3())) if seen else site.whereabouts.say_at_start()
     told = site.vehicle.state
@@ -102,7 +100,7 @@ def test_the_anchor_is_lost_with_an_interruption_and_says_which(
         site.whereabouts.pose()
 
 
-def test_the_board_is_believed_over_odometry_and_a_contradiction_is_told(site: Site) -> None:
+def test_the_board_is_believed_over_odometry_and_a_contradiction_is_told(site: Site):
     site.whereabouts.say_at_start()
     site.whereabouts.enter(JOB)
     start = site.whereabouts.pose()
@@ -115,7 +113,7 @@ def test_the_board_is_believed_over_odometry_and_a_contradiction_is_told(site: S
     assert site.whereabouts.see(turned) is None, "it stands where it was seen before, turned by as much"
 
 
-def test_another_jobs_board_tells_nothing_about_this_place(site: Site) -> None:
+def test_another_jobs_board_tells_nothing_about_this_place(site: Site):
     site.whereabouts.say_at_start()
     site.whereabouts.enter(JOB)
     board = JOB.board.model_copy(update={"spec": "marked_dots:9x7:25mm"})
@@ -124,7 +122,7 @@ def test_another_jobs_board_tells_nothing_about_this_place(site: Site) -> None:
         site.whereabouts.pose()
 
 
-def test_what_was_seen_at_one_stop_counts_at_the_next_and_each_stop_is_kept_clear_of(site: Site) -> None:
+def test_what_was_seen_at_one_stop_counts_at_the_next_and_each_stop_is_kept_clear_of(site: Site):
     left, right = (load_job(f"two-stations#{k}")[0] for k in (1, 2))
     site.whereabouts.enter(left)
     site.whereabouts.see(Planar.of(left.approach.target.se3()))
@@ -145,7 +143,7 @@ def seen_at(site: Site, pose: Planar) -> Way:
     return Way(JOB, VEHICLE_FROM_BASE, site.whereabouts)
 
 
-def test_a_way_through_the_table_is_refused_and_the_planned_one_is_not(site: Site) -> None:
+def test_a_way_through_the_table_is_refused_and_the_planned_one_is_not(site: Site):
     target, staging = Planar.of(JOB.approach.target.se3()), Planar.of(JOB.approach.staging.se3())
     way = seen_at(site, staging)
     way.require_line(target)
@@ -158,7 +156,7 @@ def test_a_way_through_the_table_is_refused_and_the_planned_one_is_not(site: Sit
         near.require_turn(math.radians(45))
 
 
-def test_the_longer_it_was_not_seen_the_more_room_it_needs(site: Site) -> None:
+def test_the_longer_it_was_not_seen_the_more_room_it_needs(site: Site):
     close = Planar(-0.95, -0.2, 0.0)  # its front 100 mm before the table
     way = seen_at(site, Planar(-1.2, -0.2, 0.0))
     way.require_line(close)
@@ -167,7 +165,7 @@ def test_the_longer_it_was_not_seen_the_more_room_it_needs(site: Site) -> None:
         way.require_line(close)
 
 
-def test_turns_on_the_spot_are_counted_and_need_room_too(site: Site) -> None:
+def test_turns_on_the_spot_are_counted_and_need_room_too(site: Site):
     close = Planar(-0.95, -0.2, 0.0)
     way = seen_at(site, Planar(-1.2, -0.2, 0.0))
     way.require_line(close)
@@ -184,7 +182,7 @@ def test_turns_on_the_spot_are_counted_and_need_room_too(site: Site) -> None:
     way.require_line(close)
 
 
-def test_a_turn_is_refused_for_what_it_adds_to_what_is_not_known(site: Site) -> None:
+def test_a_turn_is_refused_for_what_it_adds_to_what_is_not_known(site: Site):
     way = seen_at(site, Planar(-1.2, -0.2, 0.0))
     way.require_turn(math.radians(20))
     site.whereabouts.turned = 4.0
@@ -193,7 +191,7 @@ def test_a_turn_is_refused_for_what_it_adds_to_what_is_not_known(site: Site) -> 
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
-def test_the_heading_is_off_by_no_more_than_is_reckoned_with_in_a_harsh_cell(seed: int) -> None:
+def test_the_heading_is_off_by_no_more_than_is_reckoned_with_in_a_harsh_cell(seed: int):
     site = Site(seed, "harsh")
     site.whereabouts.enter(JOB)
     site.whereabouts.see(site.truth())
@@ -205,7 +203,7 @@ def test_the_heading_is_off_by_no_more_than_is_reckoned_with_in_a_harsh_cell(see
     assert off < TURN_DRIFT * site.whereabouts.turned
 
 
-def test_a_curve_is_way_and_no_turn_on_the_spot(site: Site) -> None:
+def test_a_curve_is_way_and_no_turn_on_the_spot(site: Site):
     site.whereabouts.enter(JOB)
     site.whereabouts.see(Planar(-3.0, 0.0, 0.0))
     site.vehicle.enable()
@@ -216,7 +214,7 @@ def test_a_curve_is_way_and_no_turn_on_the_spot(site: Site) -> None:
     assert site.whereabouts.way > 0.5 and site.whereabouts.turned < 0.02
 
 
-def test_it_goes_no_further_unseen_than_the_jobs_way_to_its_staging_pose(site: Site) -> None:
+def test_it_goes_no_further_unseen_than_the_jobs_way_to_its_staging_pose(site: Site):
     way = seen_at(site, Planar(-3.05, -0.6, 0.0))
     way.require_line(Planar(-1.85, -0.6, 0.0))
     far = seen_at(site, Planar(-4.5, -0.6, 0.0))
@@ -224,7 +222,7 @@ def test_it_goes_no_further_unseen_than_the_jobs_way_to_its_staging_pose(site: S
         far.require_line(Planar(-1.85, -0.6, 0.0))
 
 
-def test_a_way_that_lasts_minutes_is_looked_at_to_its_end(site: Site) -> None:
+def test_a_way_that_lasts_minutes_is_looked_at_to_its_end(site: Site):
     far = seen_at(site, Planar(-10.0, 0.0, 0.0))
     with pytest.raises(RefusedError, match=r"8\.15 m on odometry alone .* allowed 1\.45 m"):
         far.require_line(Planar(-1.85, 0.0, 0.0), share=0.01)
@@ -232,7 +230,7 @@ def test_a_way_that_lasts_minutes_is_looked_at_to_its_end(site: Site) -> None:
     assert slow.require_line(Planar(-1.85, 0.0, 0.0), share=0.01).x == pytest.approx(-1.85, abs=1e-3)
 
 
-def test_the_distance_between_outlines_is_that_of_their_nearest_points() -> None:
+def test_the_distance_between_outlines_is_that_of_their_nearest_points():
     square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     for aside, expected in (((1.3, 0.4), 0.3), ((1.3, 1.4), 0.5), ((0.5, 0.5), 0.0)):
         assert distance(square, square + np.array(aside)) == pytest.approx(expected)

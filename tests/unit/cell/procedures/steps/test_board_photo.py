@@ -23,8 +23,8 @@ from tests.support.report_runs import CONFIG
 
 
 def test_every_look_at_the_board_is_taken_with_the_exposure_that_is_configured(
-    placed_pot: JobRecord, station: Station, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    placed_pot: JobRecord, station: Station, monkeypatch
+):
     class Taken(Exception):
         """The camera was asked."""
 
@@ -42,9 +42,7 @@ def test_every_look_at_the_board_is_taken_with_the_exposure_that_is_configured(
     assert asked == [(CONFIG.target_camera.photo_exposure, PHOTO_RATE_HZ)] * 2
 
 
-def test_items_share_a_photograph_until_odometry_tells_that_the_vehicle_moved(
-    placed_pot: JobRecord, station: Station
-) -> None:
+def test_items_share_a_photograph_until_odometry_tells_that_the_vehicle_moved(placed_pot: JobRecord, station: Station):
     there, fix = station(), placed_pot.results["board_photo"]
     there.work.whereabouts.see(Planar(0.0, 0.0, 0.0))
     stands = replace(placed_pot.results["drive_to_target"], shared=fix)
@@ -63,7 +61,7 @@ def test_items_share_a_photograph_until_odometry_tells_that_the_vehicle_moved(
 @pytest.mark.parametrize("pushed", [0.0, 0.03])
 def test_the_next_part_begins_where_the_arm_photographed_the_board_unless_the_vehicle_stands_elsewhere(
     placed_pot: JobRecord, station: Station, pushed: float
-) -> None:
+):
     said: list[str] = []
     site = station(further=pushed, notify=lambda event: said.append(event.data.get("text", "")))
     fix = placed_pot.results["board_photo"]
@@ -124,7 +122,7 @@ class SwingingBoard:
         return until_quiet(VEHICLE, self.photograph, self.wait, lambda share, text: self.said.append(text))
 
 
-def test_a_board_that_stands_still_is_not_waited_for() -> None:
+def test_a_board_that_stands_still_is_not_waited_for():
     for seed in range(200):
         board = SwingingBoard(0.0, seed=seed)
         fix = board.fixed()
@@ -134,11 +132,11 @@ def test_a_board_that_stands_still_is_not_waited_for() -> None:
 
 
 @pytest.mark.parametrize("hz", [2.0, 4.0, 7.0])
-def test_what_it_goes_to_and_fro_is_told_within_half_of_it(hz: float) -> None:
+def test_what_it_goes_to_and_fro_is_told_within_half_of_it(hz: float):
     assert SwingingBoard(0.1e-3, hz).photograph().swung == pytest.approx(0.1e-3, rel=0.5)
 
 
-def test_a_vehicle_that_comes_to_rest_is_waited_for() -> None:
+def test_a_vehicle_that_comes_to_rest_is_waited_for():
     board = SwingingBoard(0.5e-3, lasts=0.8)
     fix = board.fixed()
     assert fix.swung == 0.0
@@ -147,7 +145,7 @@ def test_a_vehicle_that_comes_to_rest_is_waited_for() -> None:
     assert "waiting until the vehicle is quiet: the board goes to and fro by ±0." in board.said[0]
 
 
-def test_one_that_does_not_is_stated_and_noted() -> None:
+def test_one_that_does_not_is_stated_and_noted():
     board = SwingingBoard(0.1e-3)
     fix = board.fixed()
     assert board.now == pytest.approx(WAITS * WAIT_S + (WAITS + 1) * 4 * APART_S)
@@ -157,19 +155,19 @@ def test_one_that_does_not_is_stated_and_noted() -> None:
     assert np.sqrt(np.diag(fix.covariance)[:3]) == pytest.approx([0.1e-3 / np.sqrt(2)] * 3, rel=0.5)
 
 
-def test_what_is_stated_of_a_board_that_swings_is_its_mean_square_and_the_roll_that_shows_so() -> None:
+def test_what_is_stated_of_a_board_that_swings_is_its_mean_square_and_the_roll_that_shows_so():
     # The board faces up: a roll moves it to the side by its height above the ground, and a camera above sees no more.
     above = float(BASE_FROM_BOARD.translation[2] - VEHICLE.translation[2])
     stated = swing_covariance(1e-4, BASE_FROM_BOARD, VEHICLE)
     np.testing.assert_allclose(stated, np.diag([0.5e-8] * 3 + [0.5e-8 / above**2] * 3))
 
 
-def test_one_that_rocks_too_much_is_refused_by_name() -> None:
+def test_one_that_rocks_too_much_is_refused_by_name():
     with pytest.raises(RefusedError, match=r"the vehicle rocks by ±1\.\d\d mrad, which moves the board by"):
         SwingingBoard(1e-3).fixed()
 
 
-def test_what_the_points_own_noise_does_is_no_swing_however_near_the_board_is_seen() -> None:
+def test_what_the_points_own_noise_does_is_no_swing_however_near_the_board_is_seen():
     """With a metre to a pixel no least height hides it: only the points' own standard deviations tell it."""
     for seed in range(50):
         board = SwingingBoard(0.0, seed=seed)
@@ -177,7 +175,7 @@ def test_what_the_points_own_noise_does_is_no_swing_however_near_the_board_is_se
     assert swing([replace(view, sigma=0.1 * view.sigma) for view in (board.view() for _ in range(4))], 1.0) > 0.0
 
 
-def test_views_that_share_no_point_or_are_but_one_tell_nothing() -> None:
+def test_views_that_share_no_point_or_are_but_one_tell_nothing():
     one = SwingingBoard(1e-3).view()
     assert swing([one], AWAY / FOCAL) == 0.0
     few = [
@@ -187,13 +185,13 @@ def test_views_that_share_no_point_or_are_but_one_tell_nothing() -> None:
     assert swing(few, AWAY / FOCAL) == 0.0
 
 
-def test_the_simulated_cell_of_firm_tyres_is_quiet(placed_pot: JobRecord) -> None:
+def test_the_simulated_cell_of_firm_tyres_is_quiet(placed_pot: JobRecord):
     fix = placed_pot.results["board_photo"]
     assert len(fix.views) > 1
     assert fix.swung == 0.0
 
 
-def test_a_vehicle_that_was_pushed_after_the_photograph_is_refused(placed_pot: JobRecord, station: Station) -> None:
+def test_a_vehicle_that_was_pushed_after_the_photograph_is_refused(placed_pot: JobRecord, station: Station):
     def look(further: float) -> None:
         work = station(further=further, folded=False).work
         require_board_unmoved(work, placed_pot.results["board_photo"], "before the sweep", lambda share, text: None)
@@ -205,7 +203,7 @@ def test_a_vehicle_that_was_pushed_after_the_photograph_is_refused(placed_pot: J
     assert (number.name, number.value) == ("board moved by", pytest.approx(1.0, abs=0.3))
 
 
-def test_where_the_board_alone_decides_it_is_looked_at_again_before_the_part_goes_down(station: Station) -> None:
+def test_where_the_board_alone_decides_it_is_looked_at_again_before_the_part_goes_down(station: Station):
     """The surface does not tell: round, it lies the same however it was turned, and where the board has gone."""
 
     def moved(cell: VirtualCell) -> None:
@@ -222,7 +220,7 @@ def test_where_the_board_alone_decides_it_is_looked_at_again_before_the_part_goe
     assert site.cell.world.part.held
 
 
-def test_what_the_cameras_mounting_is_off_by_does_not_hide_it(placed_pot: JobRecord) -> None:
+def test_what_the_cameras_mounting_is_off_by_does_not_hide_it(placed_pot: JobRecord):
     fix = placed_pot.results["board_photo"]
     # Part of what is stated of the board, and no more than that.
     assert np.linalg.eigvalsh(fix.by_mount).min() > -1e-12

@@ -1,7 +1,6 @@
 """A part out of its place is gripped again and placed by what was seen, where that helps, and only there."""
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from tests.support.lying_part import Lying, LyingPart, moved
 from tests.support.report_runs import pot
 
 
-def test_a_part_that_lies_aside_is_gripped_and_placed_where_it_belongs(lying_part: Lying) -> None:
+def test_a_part_that_lies_aside_is_gripped_and_placed_where_it_belongs(lying_part: Lying):
     site = lying_part(also="corrections = 1")
     found = site.looked(moved(0.2e-3, 0.8e-3, 0.35e-3, turn=(0.0, 0.0, 0.007)))
     (before,) = found.before
@@ -36,7 +35,7 @@ def test_a_part_that_lies_aside_is_gripped_and_placed_where_it_belongs(lying_par
     assert any("it is gripped and placed again" in note for note in site.notes)
 
 
-def test_a_part_that_lies_on_something_is_left_there(lying_part: Lying) -> None:
+def test_a_part_that_lies_on_something_is_left_there(lying_part: Lying):
     """Placed again it would lie as high."""
     site = lying_part(also="corrections = 3")
     # Moved to its place along the surface it would be as high.
@@ -47,9 +46,7 @@ def test_a_part_that_lies_on_something_is_left_there(lying_part: Lying) -> None:
     assert any(note.startswith("no correction of the placed part") for note in site.notes)
 
 
-def test_how_a_part_slips_each_time_the_claw_opens_is_seen_and_allowed_for(
-    placed_pot: JobRecord, tmp_path: Path
-) -> None:
+def test_how_a_part_slips_each_time_the_claw_opens_is_seen_and_allowed_for(placed_pot: JobRecord, tmp_path):
     slips = opened(motion(0.5, turn=(0, 0, 3)))
     site = LyingPart(
         placed_pot, tmp_path, also='corrections = 2\naccept = "0.2 mm"', changed=lambda cell: slips(cell.world)
@@ -68,7 +65,7 @@ def test_how_a_part_slips_each_time_the_claw_opens_is_seen_and_allowed_for(
 
 def test_what_is_in_the_way_to_the_part_ends_the_run_with_the_part_where_it_lay(
     placed_pot: JobRecord, lying_part: Lying
-) -> None:
+):
     """A force on the fingers from 10 mm above it on, as of a bolt that stands beside the part."""
 
     def bolt(cell: VirtualCell) -> None:
@@ -102,20 +99,20 @@ def test_what_is_in_the_way_to_the_part_ends_the_run_with_the_part_where_it_lay(
     assert np.allclose(site.lies().homogeneous, off.homogeneous, atol=1e-9)
 
 
-def test_what_is_interrupted_is_left_to_a_person() -> None:
+def test_what_is_interrupted_is_left_to_a_person():
     """The part may be between the fingers then."""
     step = verify.STEP.policy
     assert (step.max_retries, step.retry_on, step.on_failure) == (0, (), OnFailure.STOP)
 
 
-def test_a_part_that_lies_too_far_aside_is_not_gripped(lying_part: Lying) -> None:
+def test_a_part_that_lies_too_far_aside_is_not_gripped(lying_part: Lying):
     site = lying_part(also="corrections = 1")
     with pytest.raises(MisplacedError):
         site.looked(moved(3e-3, z=1.5e-3))
     assert site.parts == [] and any("farther than 2 mm" in note for note in site.notes)
 
 
-def test_the_more_corrections_are_left_the_less_is_one_content_with() -> None:
+def test_the_more_corrections_are_left_the_less_is_one_content_with():
     """Closed forms of a Rayleigh distribution: its mean, and the mean of the lesser of a draw and that."""
     sigma = 40e-6
     drawn = np.random.default_rng(7).rayleigh(sigma, 400_000)

@@ -22,7 +22,7 @@ from tests.unit.cell.procedures.drive.test_driving import LateVehicle, moved
 from tests.unit.cell.procedures.drive.test_way import CONFIG, JOB, VEHICLE_FROM_BASE, Site
 
 
-def test_a_vehicle_that_nobody_knows_about_is_not_driven_and_told_what_to_do() -> None:
+def test_a_vehicle_that_nobody_knows_about_is_not_driven_and_told_what_to_do():
     site = Site()
     stood = site.truth()
     with pytest.raises(RefusedError, match=r"has just connected.*no board found") as refused:
@@ -32,7 +32,7 @@ def test_a_vehicle_that_nobody_knows_about_is_not_driven_and_told_what_to_do() -
     assert moved(stood, site.truth()) == 0.0
 
 
-def test_after_a_jog_in_another_process_three_runs_are_refused_and_nothing_drives() -> None:
+def test_after_a_jog_in_another_process_three_runs_are_refused_and_nothing_drives():
     site = Site()
     site.turn(math.radians(30))
     for _ in range(3):
@@ -44,7 +44,7 @@ def test_after_a_jog_in_another_process_three_runs_are_refused_and_nothing_drive
 
 
 @pytest.mark.parametrize("seed", [2, 5])
-def test_from_its_start_it_comes_to_the_target_and_stands_there_in_later_runs(seed: int) -> None:
+def test_from_its_start_it_comes_to_the_target_and_stands_there_in_later_runs(seed: int):
     site = Site(seed)
     site.whereabouts.say_at_start()
     arrival = site.run()
@@ -57,7 +57,7 @@ def test_from_its_start_it_comes_to_the_target_and_stands_there_in_later_runs(se
 
 
 @pytest.mark.parametrize("off", [Planar(0.0, 0.04, 0.0), Planar(0.0, 0.0, math.radians(3)), Planar(-0.04, 0.0, 0.0)])
-def test_a_vehicle_that_stands_beside_its_target_or_turned_is_brought_there_and_braked(off: Planar) -> None:
+def test_a_vehicle_that_stands_beside_its_target_or_turned_is_brought_there_and_braked(off: Planar):
     site = Site()
     target = Planar.of(JOB.approach.target.se3())
     stands, model = target * off, site.cell.world.vehicle
@@ -73,7 +73,7 @@ def test_a_vehicle_that_stands_beside_its_target_or_turned_is_brought_there_and_
 
 
 @pytest.mark.parametrize("shimmers", [True, False])
-def test_a_target_that_is_not_met_is_refused_with_the_vehicle_braked(shimmers: bool) -> None:
+def test_a_target_that_is_not_met_is_refused_with_the_vehicle_braked(shimmers: bool):
     """The board is seen turned about the vehicle, by a degree more each time as in shimmering air, or always by three
     from where it stood at first: however the vehicle turns, it is off."""
     site, seen, first, stood = Site(), 0.0, [], []
@@ -103,7 +103,7 @@ def test_a_target_that_is_not_met_is_refused_with_the_vehicle_braked(shimmers: b
     assert (stood[9].x, stood[9].yaw) == pytest.approx((site.truth().x, site.truth().yaw), abs=1e-9)
 
 
-def test_a_vehicle_that_late_readings_let_pass_its_goal_is_brought_back_to_see_the_board() -> None:
+def test_a_vehicle_that_late_readings_let_pass_its_goal_is_brought_back_to_see_the_board():
     site = Site()
     way = moved(Planar.of(JOB.approach.start.se3()), Planar.of(JOB.approach.staging.se3()))
     site.vehicle = LateVehicle(site.cell, way - 0.05, 0.6, looks_new=True)
@@ -122,7 +122,7 @@ def test_a_vehicle_that_late_readings_let_pass_its_goal_is_brought_back_to_see_t
     assert ["brought there" in note for note in site.notes] == [True]
 
 
-def test_a_jog_in_the_same_process_is_counted_by_odometry() -> None:
+def test_a_jog_in_the_same_process_is_counted_by_odometry():
     site = Site()
     site.whereabouts.say_at_start()
     site.turn(math.radians(20))
@@ -135,7 +135,7 @@ def test_a_jog_in_the_same_process_is_counted_by_odometry() -> None:
     assert moved(Planar.of(JOB.approach.target.se3()), site.truth()) < 0.02
 
 
-def test_somebody_who_is_wrong_about_the_start_gets_no_further_than_its_way() -> None:
+def test_somebody_who_is_wrong_about_the_start_gets_no_further_than_its_way():
     """Turned by 30° and said to be at its start: it goes that way once, sees nothing, and is not driven again."""
     site = Site()
     site.turn(math.radians(30))
@@ -150,7 +150,7 @@ def test_somebody_who_is_wrong_about_the_start_gets_no_further_than_its_way() ->
     assert site.cell.world.collisions.found == ()
 
 
-def test_a_target_in_the_table_is_not_driven_to() -> None:
+def test_a_target_in_the_table_is_not_driven_to():
     site = Site()
     site.whereabouts.say_at_start()
     target = JOB.approach.target.model_copy(update={"translation": (-0.8, 0.0, -0.6)})
@@ -160,7 +160,7 @@ def test_a_target_in_the_table_is_not_driven_to() -> None:
     assert site.cell.world.collisions.found == ()
 
 
-def test_a_way_is_checked_at_the_pace_at_which_it_is_driven() -> None:
+def test_a_way_is_checked_at_the_pace_at_which_it_is_driven():
     """A slow vehicle comes later to its line: nearer to what stands beside it."""
     stands = Pose(translation=("-1750 mm", "660 mm", "-500 mm"), rotation=("0 deg",) * 3)
     fixture = StationObstacle(name="fixture", size=("200 mm",) * 3, place_from_centre=stands)
@@ -202,7 +202,7 @@ class TwoStations(Site):
 
 
 @pytest.mark.parametrize(("seed", "known"), [(2, True), (5, False)])
-def test_from_one_stop_it_backs_and_drives_round_to_the_next(seed: int, known: bool) -> None:
+def test_from_one_stop_it_backs_and_drives_round_to_the_next(seed: int, known: bool):
     """By odometry, or in a new process by the board of the stop before which it stands."""
     site = TwoStations(seed)
     if known:
@@ -219,7 +219,7 @@ def test_from_one_stop_it_backs_and_drives_round_to_the_next(seed: int, known: b
     assert moved(Planar.of(site.left.approach.target.se3()), site.truth()) < 0.012
 
 
-def test_a_vehicle_that_sees_the_board_of_no_stop_is_not_driven() -> None:
+def test_a_vehicle_that_sees_the_board_of_no_stop_is_not_driven():
     site = TwoStations(2)
     site.boards[site.left.board] = site.boards[site.right.board]
     with pytest.raises(RefusedError, match=r"has just connected.*no board found"):

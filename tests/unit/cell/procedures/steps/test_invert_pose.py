@@ -50,7 +50,7 @@ def inverted_of_droop(record: JobRecord, sag: float) -> PlacePose:
 
 
 @pytest.mark.parametrize("sag", [0.15e-3, -0.1e-3])
-def test_a_carriage_that_droops_is_told_and_in_the_stated_covariance(placed_pot: JobRecord, sag: float) -> None:
+def test_a_carriage_that_droops_is_told_and_in_the_stated_covariance(placed_pot: JobRecord, sag: float):
     good, found = placed_pot.results["invert_pose"], inverted_of_droop(placed_pot, sag)
     (note,) = found.notes
     assert "bowed along the rail, as if its carriage had sunk by" in note and "cell calibrate" in note
@@ -60,7 +60,7 @@ def test_a_carriage_that_droops_is_told_and_in_the_stated_covariance(placed_pot:
     assert off @ np.linalg.solve(found.covariance, off) < 12.6
 
 
-def test_without_a_droop_nothing_is_added_and_too_large_a_one_is_refused(placed_pot: JobRecord) -> None:
+def test_without_a_droop_nothing_is_added_and_too_large_a_one_is_refused(placed_pot: JobRecord):
     good, found = placed_pot.results["invert_pose"], inverted_of_droop(placed_pot, 0.0)
     assert found.notes == good.notes == ()
     np.testing.assert_array_equal(found.covariance, good.covariance)
@@ -68,7 +68,7 @@ def test_without_a_droop_nothing_is_added_and_too_large_a_one_is_refused(placed_
         inverted_of_droop(placed_pot, 0.4e-3)
 
 
-def test_a_rail_that_ends_at_its_zero_goes_to_its_other_end(placed_pot: JobRecord, station: Station) -> None:
+def test_a_rail_that_ends_at_its_zero_goes_to_its_other_end(placed_pot: JobRecord, station: Station):
     made, work = placed_pot.results, station(folded=False).work
     rail = work.config.rail.model_copy(update={"travel": (-0.1, 0.0)})
     work.config = work.config.model_copy(update={"rail": rail})
@@ -77,9 +77,7 @@ def test_a_rail_that_ends_at_its_zero_goes_to_its_other_end(placed_pot: JobRecor
     assert "as if its carriage had sunk by 0.1" in note
 
 
-def test_a_place_that_is_carried_on_for_a_creep_keeps_what_the_droop_adds(
-    placed_pot: JobRecord, station: Station
-) -> None:
+def test_a_place_that_is_carried_on_for_a_creep_keeps_what_the_droop_adds(placed_pot: JobRecord, station: Station):
     made, work = placed_pot.results, station(folded=False).work
     good, sweep = made["invert_pose"], made["laser_sweep"]
     rate, origin = np.array([6e-6, 0, 0, 0, 3e-6, 0]), good.base_from_surface.translation
@@ -105,8 +103,8 @@ def rolling(record: JobRecord, folder: Path, angle: float) -> AtStation:
 
 
 def test_a_vehicle_that_rolls_is_in_the_stated_covariance_though_no_height_of_the_scan_shows_it(
-    placed_pot: JobRecord, tmp_path: Path
-) -> None:
+    placed_pot: JobRecord, tmp_path
+):
     site = rolling(placed_pot, tmp_path, 0.3e-3)
     pose, found = site.do(*NAMES[1:]).pose, site.ended
     # ±.3 mrad at .6 m above the ground, one standard deviation.
@@ -115,7 +113,7 @@ def test_a_vehicle_that_rolls_is_in_the_stated_covariance_though_no_height_of_th
     assert error < stated_bound(site.job, site.nominal, pose, found.placing)["d"]
 
 
-def test_a_vehicle_that_rolls_too_much_is_refused_by_the_photographs(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_a_vehicle_that_rolls_too_much_is_refused_by_the_photographs(placed_pot: JobRecord, tmp_path):
     told = r"the vehicle rocks by ±0\.[56]\d mrad, which moves the board by ±0\.[45]\d mm"
     with pytest.raises(RefusedError, match=told):
         rolling(placed_pot, tmp_path, 0.6e-3).do("board_photo")
@@ -124,7 +122,7 @@ def test_a_vehicle_that_rolls_too_much_is_refused_by_the_photographs(placed_pot:
 @pytest.mark.campaign
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("name", ["pot", "seat", "panel"])
-def test_a_droop_since_the_calibration_is_in_the_stated_covariance_or_refused(name: str, seed: int) -> None:
+def test_a_droop_since_the_calibration_is_in_the_stated_covariance_or_refused(name: str, seed: int):
     """Prints the bow without a droop, and with one of .1 mm how far the place is off against its covariance."""
     job, mesh = load_job(name)
     nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
@@ -150,7 +148,7 @@ def test_a_droop_since_the_calibration_is_in_the_stated_covariance_or_refused(na
 @pytest.mark.parametrize("doubts", [(), ("nobody looked where the laser points",)])
 def test_where_the_place_is_known_too_little_what_was_noted_of_the_sweep_is_told(
     placed_pot: JobRecord, station: Station, doubts: tuple[str, ...]
-) -> None:
+):
     job, made = changed(pot()[0], "place", tolerance=0.05e-3), placed_pot.results
     workplace = station(job, folded=False).work
     sweep = replace(made["laser_sweep"], doubts=doubts)

@@ -3,7 +3,6 @@
 from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -39,11 +38,11 @@ LOOK = PLACE.with_step(LEAN, after="board_photo", name="look_and_place")
 
 
 @pytest.mark.parametrize(("job", "sees"), [("shell", True), ("load", True), ("pot", False), ("unload", False)])
-def test_where_the_placed_part_is_seen_on_its_surface_a_bumped_head_shows(job: str, sees: bool) -> None:
+def test_where_the_placed_part_is_seen_on_its_surface_a_bumped_head_shows(job: str, sees: bool):
     assert kind_of(load_job(job)[0]).sees_place == sees
 
 
-def test_one_more_step_is_one_step_and_one_line() -> None:
+def test_one_more_step_is_one_step_and_one_line():
     assert LOOK.names == ("drive_to_target", "board_photo", "see_lean", *PLACE.names[2:])
     assert (LOOK.sequence().success, LOOK.policy().of("see_lean").deadline_s) == ("placed", 5.0)
     only_look = LOOK.until("see_lean")
@@ -51,12 +50,12 @@ def test_one_more_step_is_one_step_and_one_line() -> None:
     assert only_look.sequence().success == "done"
 
 
-def test_a_step_whose_input_nobody_makes_is_refused() -> None:
+def test_a_step_whose_input_nobody_makes_is_refused():
     with pytest.raises(ValueError, match="step see_lean needs BoardFix, which no step before it makes"):
         PLACE.with_step(LEAN, after="drive_to_target", name="too_early")
 
 
-def test_kinds_of_other_packages_are_found_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kinds_of_other_packages_are_found_by_name(monkeypatch):
     installed = [
         EntryPoint("look_and_place", f"{__name__}:LOOK", kinds.GROUP),
         EntryPoint("place", f"{__name__}:LOOK", kinds.GROUP),
@@ -74,12 +73,12 @@ def test_kinds_of_other_packages_are_found_by_name(monkeypatch: pytest.MonkeyPat
         find_kind("lunch")
 
 
-def test_a_step_that_does_not_exist_is_named_with_those_that_do() -> None:
+def test_a_step_that_does_not_exist_is_named_with_those_that_do():
     with pytest.raises(ConfigError, match=r"no step lunch; the steps are drive_to_target, .*place"):
         PLACE.until("lunch")
 
 
-def test_a_step_finds_what_it_needs_by_type() -> None:
+def test_a_step_finds_what_it_needs_by_type():
     context = StepContext(Step("see", 1.0), 1, 1.0, {"a": Tilt(0.1), "b": 7, "c": Tilt(0.2)}, Clock(), print)
     assert (context.made(Tilt), context.made(int)) == (Tilt(0.2), 7)
     with pytest.raises(LookupError, match="see needs a PlaceResult, which none of a, b, c made"):
@@ -96,13 +95,13 @@ class Placed(PlaceResult):
     """How another package places."""
 
 
-def test_what_a_step_makes_serves_whoever_needs_a_base_of_it() -> None:
+def test_what_a_step_makes_serves_whoever_needs_a_base_of_it():
     lean = JobStep(Step("see_lean", 5.0), tilt, Leaning)
     use = JobStep(Step("use_lean", 5.0), tilt, Placed, needs=(Tilt,))
     assert Kind("leaning", (lean, use)).sequence().success == "placed"
 
 
-def test_a_step_that_made_something_else_has_failed() -> None:
+def test_a_step_that_made_something_else_has_failed():
     site = cast(Any, SimpleNamespace(needs_part=False, retried=False, held=None))
     gate = SimpleNamespace(entered=nullcontext)
     site.devices = SimpleNamespace(gate=gate, interlocks=SimpleNamespace(work_with=print))
@@ -113,9 +112,7 @@ def test_a_step_that_made_something_else_has_failed() -> None:
         work(StepContext(Step("see", 5.0), 1, 5.0, {}, Clock(), print))
 
 
-def test_a_kind_that_ends_the_program_as_it_is_loaded_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kind_that_ends_the_program_as_it_is_loaded_is_refused(tmp_path, monkeypatch):
     (tmp_path / "ends_the_program.py").write_text("import sys\nsys.exit(3)\n", encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     installed = [EntryPoint("ends", "ends_the_program:KIND", kinds.GROUP)]
@@ -167,7 +164,7 @@ def ways(kind: Kind) -> dict[str, tuple[Transition, ...]]:
 
 
 @pytest.mark.parametrize("name", ALL_KINDS)
-def test_of_each_kind_every_transition_is_legal_where_it_stands_and_no_other(name: str) -> None:
+def test_of_each_kind_every_transition_is_legal_where_it_stands_and_no_other(name: str):
     kind = ALL_KINDS[name]
     found, rows = ways(kind), kind.sequence().table
     assert set(found) == {row.source for row in rows}, "a state that nothing leads to"
@@ -180,7 +177,7 @@ def test_of_each_kind_every_transition_is_legal_where_it_stands_and_no_other(nam
 
 
 @pytest.mark.parametrize("name", ALL_KINDS)
-def test_of_each_kind_no_state_is_a_dead_end_and_each_can_be_aborted_and_fail(name: str) -> None:
+def test_of_each_kind_no_state_is_a_dead_end_and_each_can_be_aborted_and_fail(name: str):
     kind = ALL_KINDS[name]
     sequence = kind.sequence()
     for state, way in ways(kind).items():

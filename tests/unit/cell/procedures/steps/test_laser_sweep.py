@@ -16,7 +16,7 @@ from tests.support.at_station import Station
 
 
 @pytest.mark.parametrize(("attempt", "share"), [(1, 1.0), (2, 0.5), (3, 0.25)])
-def test_each_repetition_is_half_as_fast_with_the_lines_as_close(attempt: int, share: float) -> None:
+def test_each_repetition_is_half_as_fast_with_the_lines_as_close(attempt: int, share: float):
     scan = load_job("pot")[0].scan
     again = slowed_down(scan, attempt)
     assert again.speed == pytest.approx(share * scan.speed)
@@ -24,7 +24,7 @@ def test_each_repetition_is_half_as_fast_with_the_lines_as_close(attempt: int, s
     assert again.length == scan.length
 
 
-def test_a_repetition_is_no_slower_than_its_step_has_time_for() -> None:
+def test_a_repetition_is_no_slower_than_its_step_has_time_for():
     scan = load_job("pot")[0].scan
     slow = scan.model_copy(update={"speed": scan.length / 80.0})
     assert scan.length / slowed_down(slow, 3).speed == pytest.approx(LONGEST_SWEEP_S)
@@ -32,8 +32,8 @@ def test_a_repetition_is_no_slower_than_its_step_has_time_for() -> None:
 
 @pytest.mark.parametrize(("fault", "mode"), [("", 5), ("rail.lost_steps", 5), ("", 1)])
 def test_after_a_sweep_the_rails_count_is_compared_with_its_reference_switch(
-    placed_pot: JobRecord, station: Station, fault: str, mode: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    placed_pot: JobRecord, station: Station, fault: str, mode: int, monkeypatch
+):
     """Lost steps refuse what was swept; a rail that does not show its switch leaves a doubt."""
     site, told = station(), []
     rail = site.cell.devices.rail
@@ -55,7 +55,7 @@ def test_after_a_sweep_the_rails_count_is_compared_with_its_reference_switch(
     assert "looking whether the rail has lost steps" in told
 
 
-def test_steps_lost_in_a_sweep_with_a_second_look_are_found_after_its_way_back(station: Station) -> None:
+def test_steps_lost_in_a_sweep_with_a_second_look_are_found_after_its_way_back(station: Station):
     def lose(event: Event) -> None:
         if "whether the surface lies still: preparing" in event.data.get("text", ""):
             site.cell.fault("rail.lost_steps")
@@ -75,8 +75,8 @@ def test_steps_lost_in_a_sweep_with_a_second_look_are_found_after_its_way_back(s
 )  # fmt: skip
 def test_a_part_goes_by_the_look_at_the_head_of_a_part_before_for_ten_minutes(
     placed_pot: JobRecord, station: Station, ago: float, seen: bool, attempt: int, held: bool, shared: bool,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    monkeypatch,
+):  # fmt: skip
     """Where nobody looks at the placed parts, not at all."""
     site = station()
     site.work.shares_look, kept = seen, list[str]()

@@ -24,7 +24,7 @@ from tests.support.described_cells import LEAN, described, quick_job
 from tests.support.unloading import JOB, Change, unloaded, where_unloaded
 
 
-def test_a_part_that_sticks_is_let_go_where_it_lies(unloaded_part: JobRecord, tmp_path: Path) -> None:
+def test_a_part_that_sticks_is_let_go_where_it_lies(unloaded_part: JobRecord, tmp_path):
     site = where_unloaded(unloaded_part, tmp_path)
     lay, part = from_matrix(site.cell.truth()["poses"]["surface_from_part"]), site.cell.world.part
     part.sticks = 60.0
@@ -36,7 +36,7 @@ def test_a_part_that_sticks_is_let_go_where_it_lies(unloaded_part: JobRecord, tm
     assert site.cell.world.arm.safety is Safety.NORMAL
 
 
-def test_a_grasp_that_was_seen_is_known_to_that_and_to_what_closing_moves() -> None:
+def test_a_grasp_that_was_seen_is_known_to_that_and_to_what_closing_moves():
     held = from_parts((0.001, -0.002, 0.17), pin.exp3(np.array([0.01, -0.02, 0.5])))
     seen = np.diag([30e-6**2, 40e-6**2, 20e-6**2, 0.3e-3**2, 0.1e-3**2, 0.2e-3**2])
     grasp = job_with_grasp(JOB, held, seen).grasp
@@ -45,7 +45,7 @@ def test_a_grasp_that_was_seen_is_known_to_that_and_to_what_closing_moves() -> N
     assert grasp.sigma_angle == float(np.sqrt(0.3e-3**2 + GRIPPED[3, 3])) and grasp.size == JOB.grasp.size
 
 
-def test_a_part_is_taken_from_its_surface_into_its_nest(unloaded_part: JobRecord) -> None:
+def test_a_part_is_taken_from_its_surface_into_its_nest(unloaded_part: JobRecord):
     done = unloaded_part
     assert done.at_sweep and done.at_end and done.folder and JOB.nest
     lay, lies = (from_matrix(truth["poses"]["base_from_part"]) for truth in (done.at_sweep, done.at_end))
@@ -67,9 +67,7 @@ def test_a_part_is_taken_from_its_surface_into_its_nest(unloaded_part: JobRecord
     assert all(each.same for each in replay(done.folder))
 
 
-def test_steps_that_the_rail_lost_are_found_before_the_grip(
-    unloaded_part: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_steps_that_the_rail_lost_are_found_before_the_grip(unloaded_part: JobRecord, tmp_path, monkeypatch):
     site = where_unloaded(unloaded_part, tmp_path)
     lose_few_steps_after_the_look(monkeypatch, lambda: site.cell)
     with pytest.raises(DeviceFault, match="lost steps"):
@@ -78,8 +76,8 @@ def test_steps_that_the_rail_lost_are_found_before_the_grip(
 
 
 def test_a_part_that_is_lost_as_it_is_lifted_is_known_to_nobody_and_that_is_noted(
-    unloaded_part: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    unloaded_part: JobRecord, tmp_path, monkeypatch
+):
     site, parts = where_unloaded(unloaded_part, tmp_path), list[object]()
     site.notify = lambda event: parts.append(event.data.get("part"))
     monkeypatch.setattr(type(site.cell.devices.claw), "holding", property(lambda claw: False))
@@ -109,7 +107,7 @@ def hold(cell: VirtualCell) -> None:
 )
 def test_where_there_is_no_part_or_the_claw_is_full_nothing_is_gripped(
     placed_pot: JobRecord, change: Change, stage: str, told: str
-) -> None:
+):
     done = unloaded(placed_pot, change)
     assert (done.outcome, done.stage) == ("refused", stage) and told in done.reason
     assert "pick" not in done.results
@@ -117,7 +115,7 @@ def test_where_there_is_no_part_or_the_claw_is_full_nothing_is_gripped(
 
 def test_through_the_public_door_it_is_not_resumed_once_it_was_gripped_and_the_next_part_lies_there(
     placed_pot: JobRecord, calibrated_folder: Path
-) -> None:
+):
     unload, (lean, _) = quick_job("unload", calibrated_folder, 20.0), described(calibrated_folder, LEAN)
     with Cell.open(lean, sim="all", seed=placed_pot.seed, clock="virtual", job=unload) as cell:
 

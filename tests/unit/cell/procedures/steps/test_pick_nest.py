@@ -44,9 +44,7 @@ def before_pick(record: JobRecord, folder: Path) -> AtStation:
         (0.2, "the nest is empty: nothing was seen where the part belongs"),
     ],
 )
-def test_a_part_that_is_not_in_its_nest_is_not_gripped(
-    placed_pot: JobRecord, tmp_path: Path, metres: float, told: str
-) -> None:
+def test_a_part_that_is_not_in_its_nest_is_not_gripped(placed_pot: JobRecord, tmp_path, metres: float, told: str):
     site = before_pick(placed_pot, tmp_path)
     part = site.cell.world.part
     part._base_from_part[0, 3] += metres  # type: ignore[index]
@@ -55,9 +53,7 @@ def test_a_part_that_is_not_in_its_nest_is_not_gripped(
     assert not part.held and part.untouched and site.work.part.state is PartState.NESTED
 
 
-def test_what_a_head_that_slipped_leaves_open_of_the_held_part_is_known(
-    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_head_that_slipped_leaves_open_of_the_held_part_is_known(placed_pot: JobRecord, tmp_path, monkeypatch):
     shares, slips = [], iter([Slip(0.0, 0.0, 0.0), Slip(0.09e-3, 0.0, 0.0)])
     look = pick_nest.seen_on_plate
 
@@ -76,7 +72,7 @@ def test_what_a_head_that_slipped_leaves_open_of_the_held_part_is_known(
 
 def test_an_old_part_is_swapped_for_a_new_one_and_the_item_that_was_aborted_is_resumed(
     placed_pot: JobRecord, calibrated_folder: Path
-) -> None:
+):
     file, (undrawn, _) = quick_job("swap", calibrated_folder, 20.0), described(calibrated_folder, UNDRAWN)
     once = described_cells.changed(file.read_text(encoding="utf-8"), {"place": {"corrections": "0"}})
     file.write_text(once, encoding="utf-8")
@@ -134,7 +130,7 @@ def test_an_old_part_is_swapped_for_a_new_one_and_the_item_that_was_aborted_is_r
 
 def test_a_part_that_the_claw_took_from_its_nest_is_placed_by_the_run_that_resumes(
     placed_pot: JobRecord, calibrated_folder: Path
-) -> None:
+):
     load, (undrawn, _) = quick_job("load", calibrated_folder, 20.0), described(calibrated_folder, UNDRAWN)
     unseen = described_cells.changed(load.read_text(encoding="utf-8"), {"place": {"verify": '"none"'}})
     load.write_text(unseen, encoding="utf-8")

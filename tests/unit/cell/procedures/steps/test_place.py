@@ -111,7 +111,7 @@ def site() -> Site:
 
 
 @pytest.fixture(scope="module")
-def work(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> Workplace:
+def work(placed_pot: JobRecord, tmp_path_factory) -> Workplace:
     """Where `placed_pot` placed."""
     return AtStation(placed_pot, tmp_path_factory.mktemp("place"), folded=False).work
 
@@ -120,7 +120,7 @@ def normal() -> np.ndarray:
     return np.asarray(JOB.grasp.flange_from_part.se3().rotation[:, 2])
 
 
-def test_the_part_is_put_down_in_contact_and_that_is_noted_before_the_retreat(site: Site) -> None:
+def test_the_part_is_put_down_in_contact_and_that_is_noted_before_the_retreat(site: Site):
     above: list[float] = []
 
     def note(part: PartProgress) -> None:
@@ -153,14 +153,14 @@ def test_the_part_is_put_down_in_contact_and_that_is_noted_before_the_retreat(si
     np.testing.assert_allclose(site.mover.joints, HOME, atol=2e-3)
 
 
-def test_who_leaves_a_placed_part_may_be_near_that_and_nothing_else() -> None:
+def test_who_leaves_a_placed_part_may_be_near_that_and_nothing_else():
     near = [("claw", PLACED), ("claw", "table")]
     mover = Mover(VirtualCell(CONFIG, seed=1).devices.arm, Clock(), CONFIG, JOB)
     mover._planner = cast(Any, SimpleNamespace(collisions=SimpleNamespace(touching=lambda start: near)))
     assert mover._leaving(HOME) == (("claw", PLACED),)
 
 
-def test_a_straight_line_gains_its_speed_gently() -> None:
+def test_a_straight_line_gains_its_speed_gently():
     """At most by its speed in a third of a second, planned beforehand or not."""
     mover, speed = Site().mover, 0.05
     lines: list[Trajectory] = []
@@ -177,7 +177,7 @@ def test_a_straight_line_gains_its_speed_gently() -> None:
         assert times[np.argmax(fast > 0.9 * speed)] > 0.9 / 3
 
 
-def test_near_its_place_a_line_of_a_higher_speed_takes_no_longer() -> None:
+def test_near_its_place_a_line_of_a_higher_speed_takes_no_longer():
     mover = Site().mover
     lines: list[Trajectory] = []
     mover.follow = lambda line, *_: bool(lines.append(line))  # type: ignore[method-assign]
@@ -187,7 +187,7 @@ def test_near_its_place_a_line_of_a_higher_speed_takes_no_longer() -> None:
     assert np.diff([line.duration for line in lines]).max() < 0.01
 
 
-def test_what_the_force_sensor_showed_before_the_descent_is_no_touch(site: Site) -> None:
+def test_what_the_force_sensor_showed_before_the_descent_is_no_touch(site: Site):
     touch = site.cell.world.arm.contact
     drift = np.array([0.0, 0.0, 1.5 * JOB.place.contact_force, 0.0, 0.0, 0.0])
     site.cell.world.arm.contact = lambda base_from_flange: np.asarray(touch(base_from_flange)) + drift
@@ -208,7 +208,7 @@ def test_what_the_force_sensor_showed_before_the_descent_is_no_touch(site: Site)
 )
 def test_a_surface_that_comes_early_or_not_at_all_is_refused_with_the_part_held_lifted_and_not_crushed(
     site: Site, early: float, feel: float | None, told: str
-) -> None:
+):
     """Also one that is met just before the slow part of the descent, where the fast one does not feel it yet."""
     with pytest.raises(RefusedError, match=told):
         site.place(too_low=early, feel=feel)
@@ -224,7 +224,7 @@ def test_a_surface_that_comes_early_or_not_at_all_is_refused_with_the_part_held_
 @pytest.mark.parametrize(("off", "from_mm"), [(None, 1.0), (0.02e-3, 0.47), (-0.2e-3, 1.0)])
 def test_where_the_part_before_touched_as_expected_contact_is_felt_for_nearer(
     work: Workplace, off: float | None, from_mm: float
-) -> None:
+):
     work.parts_before = PartsBefore(touch_off=off)
     # Above all that would be placed: 3.5 standard deviations over the expected touch.
     assert 1e3 * felt_from(work, TouchHeight(0.05e-3, 0.07e-3)) == pytest.approx(from_mm, abs=0.01)
@@ -233,7 +233,7 @@ def test_where_the_part_before_touched_as_expected_contact_is_felt_for_nearer(
 @pytest.mark.parametrize(("too_low", "side"), [(0.4e-3, "higher"), (-0.4e-3, "lower")])
 def test_a_touch_that_contradicts_the_scan_is_refused_with_the_part_held_and_lifted(
     site: Site, too_low: float, side: str
-) -> None:
+):
     """Within the way in which contact is looked for: only what is stated of the place tells that it is wrong."""
     with pytest.raises(RefusedError, match=rf"touched 0\.\d+ mm {side} than the scan says.*verify") as caught:
         site.place(too_low=too_low)
@@ -247,7 +247,7 @@ def test_a_touch_that_contradicts_the_scan_is_refused_with_the_part_held_and_lif
 
 
 @pytest.mark.parametrize("too_low", [0.38e-3, 0.45e-3, 0.55e-3, 0.9e-3])
-def test_one_that_touches_before_it_is_felt_for_is_refused_as_well(work: Workplace, site: Site, too_low: float) -> None:
+def test_one_that_touches_before_it_is_felt_for_is_refused_as_well(work: Workplace, site: Site, too_low: float):
     """Whether the force begins on the slow part of the descent, just before it, or on the fast one."""
     work.parts_before = PartsBefore(touch_off=0.0)
     feel = felt_from(work, STATED)
@@ -258,7 +258,7 @@ def test_one_that_touches_before_it_is_felt_for_is_refused_as_well(work: Workpla
 
 
 @pytest.mark.parametrize("too_low", [0.1e-3, -0.1e-3])
-def test_a_touch_within_what_is_stated_is_placed_and_told(too_low: float) -> None:
+def test_a_touch_within_what_is_stated_is_placed_and_told(too_low: float):
     result = Site().place(too_low=too_low)
     assert result.touch.off == pytest.approx(too_low, abs=0.02e-3)
     # Pressed on until the force that lets go: the surface gives way by half a millimetre.
@@ -267,9 +267,7 @@ def test_a_touch_within_what_is_stated_is_placed_and_told(too_low: float) -> Non
 
 
 @pytest.mark.parametrize("told", [True, False])
-def test_a_stiff_touch_as_soon_as_it_is_felt_for_is_refused_with_the_part_held(
-    site: Site, told: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stiff_touch_as_soon_as_it_is_felt_for_is_refused_with_the_part_held(site: Site, told: bool, monkeypatch):
     """The way on which the force grows is too short to tell where it began; where it ended tells enough.
 
     Also for an arm that tells too few states on that way.
@@ -283,7 +281,7 @@ def test_a_stiff_touch_as_soon_as_it_is_felt_for_is_refused_with_the_part_held(
     assert site.held
 
 
-def test_nothing_is_held_between_the_last_look_and_the_release() -> None:
+def test_nothing_is_held_between_the_last_look_and_the_release():
     """A surface that is moved in a pause there would not be looked at again."""
     site, held = Site(), []
     site.mover.hold = lambda: held.append(site.held)
@@ -291,7 +289,7 @@ def test_nothing_is_held_between_the_last_look_and_the_release() -> None:
     assert held == [False]
 
 
-def test_steps_that_the_rail_lost_before_are_found_with_the_part_held_and_lifted(site: Site) -> None:
+def test_steps_that_the_rail_lost_before_are_found_with_the_part_held_and_lifted(site: Site):
     rail = site.cell.devices.rail
     rail.home().wait(60.0)
     site.cell.fault("rail.lost_steps")
@@ -305,7 +303,7 @@ def test_steps_that_the_rail_lost_before_are_found_with_the_part_held_and_lifted
     assert max(site.forces) == 0.0
 
 
-def test_a_claw_that_lost_its_part_does_not_go_down(site: Site) -> None:
+def test_a_claw_that_lost_its_part_does_not_go_down(site: Site):
     site.cell.devices.claw.bare.release()
     site.heights.clear()
     with pytest.raises(RefusedError, match="the claw lost the part before the descent"):
@@ -315,7 +313,7 @@ def test_a_claw_that_lost_its_part_does_not_go_down(site: Site) -> None:
     assert min(site.heights) > site.arm.state().flange[2] - 0.002
 
 
-def test_a_job_with_an_empty_claw_ends_before_anything_moves(site: Site) -> None:
+def test_a_job_with_an_empty_claw_ends_before_anything_moves(site: Site):
     site.cell.devices.claw.bare.release()
     workplace = Workplace(
         CONFIG, JOB, NOMINAL, cast(Any, None), site.cell.devices, NoFrames(), Path(),
@@ -328,7 +326,7 @@ def test_a_job_with_an_empty_claw_ends_before_anything_moves(site: Site) -> None
     assert np.array_equal(site.arm.state().joints, before)
 
 
-def test_a_fault_after_the_release_says_that_the_part_is_down(site: Site) -> None:
+def test_a_fault_after_the_release_says_that_the_part_is_down(site: Site):
 
     def note(part: PartProgress) -> None:
         if part.state is PartState.RELEASED:
@@ -344,7 +342,7 @@ def test_a_fault_after_the_release_says_that_the_part_is_down(site: Site) -> Non
     assert "not to be placed again" in told
 
 
-def test_a_release_that_is_not_confirmed_leaves_the_part_unknown(site: Site) -> None:
+def test_a_release_that_is_not_confirmed_leaves_the_part_unknown(site: Site):
     miswired = ArmSwitchedClaw("claw", site.arm, 5, CONFIG.claw.feedback, clock=site.cell.clock)
     with pytest.raises(DeviceFault) as caught:
         site.place(claw=miswired)
@@ -353,7 +351,7 @@ def test_a_release_that_is_not_confirmed_leaves_the_part_unknown(site: Site) -> 
     assert site.noted == [PartState.UNKNOWN]
 
 
-def test_nothing_is_placed_twice_and_nothing_moves_for_it(site: Site) -> None:
+def test_nothing_is_placed_twice_and_nothing_moves_for_it(site: Site):
     site.place()
     before = site.arm.state().joints
     with pytest.raises(RefusedError, match="the part is released, not held: nothing is placed a second time"):
@@ -372,9 +370,7 @@ def with_part(
     return AtStation(record, folder, job, NominalSurface.load(mesh, unit=job.surface.mesh_unit))
 
 
-def test_a_part_as_drawn_that_fits_the_scanned_surface_is_placed_and_its_gap_told(
-    placed_pot: JobRecord, tmp_path: Path
-) -> None:
+def test_a_part_as_drawn_that_fits_the_scanned_surface_is_placed_and_its_gap_told(placed_pot: JobRecord, tmp_path):
     found = with_part(placed_pot, tmp_path).do("place").summary()["mating"]
     assert found["seen"] > 0.75 and abs(found["median_mm"]) < 0.03
     assert found["largest_mm"] < 0.3
@@ -388,15 +384,15 @@ def test_a_part_as_drawn_that_fits_the_scanned_surface_is_placed_and_its_gap_tol
     ],
 )
 def test_a_part_as_drawn_is_held_against_the_scanned_surface_before_it_goes_down(
-    placed_pot: JobRecord, tmp_path: Path, height: float, told: str
-) -> None:
+    placed_pot: JobRecord, tmp_path, height: float, told: str
+):
     site = with_part(placed_pot, tmp_path, lambda corners: corners + np.array([0.0, 0.0, height]))
     with pytest.raises(RefusedError, match=told):
         site.do("place")
     assert site.cell.world.part.held
 
 
-def test_what_parts_had_alike_is_aimed_beside_where_the_part_fits_there(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_what_parts_had_alike_is_aimed_beside_where_the_part_fits_there(placed_pot: JobRecord, tmp_path):
     site, notes = with_part(placed_pot, tmp_path), list[str]()
     site.notify = lambda event: notes.append(str(event.data.get("text")))
     pose, aside, still = placed_pot.results["invert_pose"], from_parts((0.2e-3, 0.0, 0.0)), pin.SE3.Identity()
@@ -419,9 +415,7 @@ def test_what_parts_had_alike_is_aimed_beside_where_the_part_fits_there(placed_p
     assert any("which is not allowed for" in note for note in notes)
 
 
-def test_where_nothing_was_scanned_it_is_told_that_the_underside_was_not_looked_at(
-    placed_pot: JobRecord, tmp_path: Path
-) -> None:
+def test_where_nothing_was_scanned_it_is_told_that_the_underside_was_not_looked_at(placed_pot: JobRecord, tmp_path):
     site, said = with_part(placed_pot, tmp_path), []
     del site.made["reconstruct"]
     site.notify = said.append
@@ -430,8 +424,8 @@ def test_where_nothing_was_scanned_it_is_told_that_the_underside_was_not_looked_
 
 
 def test_what_the_part_goes_into_the_surface_is_in_the_expected_touch_and_in_the_stated_bound(
-    placed_pot: JobRecord, tmp_path: Path
-) -> None:
+    placed_pot: JobRecord, tmp_path
+):
     """Half of the underside .25 mm low, as drawn and in the simulated world: less than is allowed."""
     site = with_part(placed_pot, tmp_path, lambda v: v - np.multiply.outer(v[:, 0] > 0.0, [0.0, 0.0, 0.25e-3]))
     site.do("place")
@@ -445,7 +439,7 @@ def test_what_the_part_goes_into_the_surface_is_in_the_expected_touch_and_in_the
     assert error < cast(float, stated_bound(job, nominal, placed.pose, done.placing)["d"])
 
 
-def test_placing_is_tried_once_whatever_becomes_of_it() -> None:
+def test_placing_is_tried_once_whatever_becomes_of_it():
     step = PLACE.policy().of("place")
     assert (step.max_retries, step.retry_on, step.on_failure) == (0, (), OnFailure.STOP)
 
@@ -460,9 +454,7 @@ def test_placing_is_tried_once_whatever_becomes_of_it() -> None:
         (("unknown", "released", "unknown"), True, "releasing or gripping its part"),
     ],
 )
-def test_a_run_whose_part_may_be_down_is_not_resumed(
-    tmp_path: Path, parts: tuple[str, ...], ended: bool, words: str
-) -> None:
+def test_a_run_whose_part_may_be_down_is_not_resumed(tmp_path, parts: tuple[str, ...], ended: bool, words: str):
     """Whether it was killed or faulted afterwards: the journal had it before the retreat began."""
     journal = Journal(tmp_path, "run", {"job_file": "pot.toml", "job_hash": "0"})
     key = journal.step_started("place", 1)

@@ -1,7 +1,6 @@
 """The cloud of a job: no earlier one is taken for it, and what was refused is shown."""
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -23,8 +22,8 @@ CONFIG = load_config(None)
 
 
 def test_the_cloud_of_an_earlier_sweep_is_gone_whatever_becomes_of_this_one(
-    placed_pot: JobRecord, station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    placed_pot: JobRecord, station: Station, tmp_path, monkeypatch
+):
     def fails(*given: object) -> None:
         raise MemoryError("too many points")
 
@@ -35,9 +34,7 @@ def test_the_cloud_of_an_earlier_sweep_is_gone_whatever_becomes_of_this_one(
     assert not (tmp_path / "cloud.ply").exists()
 
 
-def test_the_cloud_is_built_with_the_laser_where_it_pointed(
-    placed_pot: JobRecord, station: Station, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_cloud_is_built_with_the_laser_where_it_pointed(placed_pot: JobRecord, station: Station, monkeypatch):
     workplace, sweep, given = station(folded=False).work, placed_pot.results["laser_sweep"], []
     monkeypatch.setattr(ScanCalibration, "variants", lambda head: given.append(head) or ())
     turned, head = Pointing(1e-3, 1e-5, 0.0), workplace.calibration.scan
@@ -49,7 +46,7 @@ def test_the_cloud_is_built_with_the_laser_where_it_pointed(
     assert not np.allclose(expected.normal, head.geometry().light_plane.normal, atol=1e-4)
 
 
-def test_a_sweep_is_kept_and_its_cloud_shown_also_where_it_is_refused(placed_pot: JobRecord, station: Station) -> None:
+def test_a_sweep_is_kept_and_its_cloud_shown_also_where_it_is_refused(placed_pot: JobRecord, station: Station):
     assert placed_pot.folder is not None and (placed_pot.folder / FILE).is_file()
     workplace, told = station(folded=False).work, []
     workplace.devices.gate.listener = cast(Any, SimpleNamespace(reading=lambda device, reading: told.append(device)))

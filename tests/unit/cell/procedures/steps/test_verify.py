@@ -40,7 +40,7 @@ OFF = moved(0.2e-3, -0.1e-3, 0.2e-3, turn=(0.002, -0.003, 0.003))
 
 
 @pytest.fixture(scope="module")
-def lying(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> tuple[PlacedPart, LyingPart]:
+def lying(placed_pot: JobRecord, tmp_path_factory) -> tuple[PlacedPart, LyingPart]:
     """A part that lies `OFF` its place and might lie better, swept as finely as shipped."""
     site = LyingPart(placed_pot, tmp_path_factory.mktemp("lying"), also="corrections = 1", faster=1.0)
     return site.looked(OFF), site
@@ -59,20 +59,18 @@ def require_seen(found: PlacedPart, off: pin.SE3) -> None:
     assert 1e3 * np.percentile(true, 95) < found.bound["d"] < 1e3 * np.percentile(true, 95) + 0.07
 
 
-def test_where_the_placed_part_lies_is_seen_beside_the_surface_to_hundredths(
-    lying: tuple[PlacedPart, LyingPart],
-) -> None:
+def test_where_the_placed_part_lies_is_seen_beside_the_surface_to_hundredths(lying: tuple[PlacedPart, LyingPart]):
     require_seen(lying[0], OFF)
 
 
-def test_a_part_in_its_place_is_left_there_although_it_might_lie_better(lying: tuple[PlacedPart, LyingPart]) -> None:
+def test_a_part_in_its_place_is_left_there_although_it_might_lie_better(lying: tuple[PlacedPart, LyingPart]):
     found, site = lying
     assert found.before == () and site.parts == []
 
 
 def test_a_fit_that_others_wrote_finds_the_part_in_the_same_place(
     placed_pot: JobRecord, lying: tuple[PlacedPart, LyingPart]
-) -> None:
+):
     """Samples of the meshes by trimesh, least squares by scipy, on the cloud and the meshes as files."""
     found, site = lying
     cloud = np.asarray(trimesh.load(site.folder / CLOUD).vertices)
@@ -113,7 +111,7 @@ def fitted(points: np.ndarray, mesh: trimesh.Trimesh) -> pin.SE3:
     return start
 
 
-def test_the_flush_along_its_edge_is_by_how_much_its_pose_lifts_it(lying: tuple[PlacedPart, LyingPart]) -> None:
+def test_the_flush_along_its_edge_is_by_how_much_its_pose_lifts_it(lying: tuple[PlacedPart, LyingPart]):
     flush = lying[0].flush
     assert flush is not None and len(flush.higher) > 15 and flush.seen > 0.8
     error = flush.higher - lifted(flush.places, OFF)
@@ -128,7 +126,7 @@ def lifted(places: np.ndarray, off: pin.SE3) -> np.ndarray:
 
 
 @pytest.mark.parametrize("much", [1.0, 1.5])
-def test_a_vehicle_that_rocks_moves_what_is_seen_no_farther_than_is_stated(lying_part: Lying, much: float) -> None:
+def test_a_vehicle_that_rocks_moves_what_is_seen_no_farther_than_is_stated(lying_part: Lying, much: float):
     """As much as 1.5 the quarters of the part disagree, but for its waves."""
 
     def rocks(cell: VirtualCell) -> None:
@@ -149,7 +147,7 @@ def test_a_vehicle_that_rocks_moves_what_is_seen_no_farther_than_is_stated(lying
     assert (np.abs(found.flush.higher - lifted(found.flush.places, moved(0.1e-3, z=0.05e-3))) < found.flush.noise).all()
 
 
-def test_a_vehicle_that_was_pushed_since_the_sweep_does_not_make_the_part_look_turned(lying_part: Lying) -> None:
+def test_a_vehicle_that_was_pushed_since_the_sweep_does_not_make_the_part_look_turned(lying_part: Lying):
     pushed = list[str]()
 
     def push(cell: VirtualCell, text: str) -> None:
@@ -167,7 +165,7 @@ def test_a_vehicle_that_was_pushed_since_the_sweep_does_not_make_the_part_look_t
     assert not found.before and "nobody looked where the claw would go" in str(site.notes)
 
 
-def test_where_nothing_of_the_surface_shows_the_earlier_sweep_tells_where_it_lies(lying_part: Lying) -> None:
+def test_where_nothing_of_the_surface_shows_the_earlier_sweep_tells_where_it_lies(lying_part: Lying):
     found = lying_part(half=(1.0, 1.0)).looked(moved(0.2e-3))
     error = difference(found.seen.surface_from_part, moved(0.2e-3))
     assert found.seen.beside == 0 and "against the surface as swept before" in found.words
@@ -175,7 +173,7 @@ def test_where_nothing_of_the_surface_shows_the_earlier_sweep_tells_where_it_lie
     assert 0.1e-3 < found.unsure < 0.25e-3
 
 
-def test_a_part_that_is_not_as_drawn_about_its_features_is_told_though_it_lies_in_its_place(lying_part: Lying) -> None:
+def test_a_part_that_is_not_as_drawn_about_its_features_is_told_though_it_lies_in_its_place(lying_part: Lying):
     """Of its top 12 mm are .5 mm lower, and its front ends .5 mm sooner."""
 
     def other(cell: VirtualCell) -> None:
@@ -217,7 +215,7 @@ def spoiled(cell: VirtualCell, covered: bool) -> None:
 @pytest.mark.parametrize("covered", [False, True])
 def test_a_part_of_which_a_piece_broke_off_or_that_is_covered_is_told_though_the_rest_lies_in_its_place(
     lying_part: Lying, covered: bool
-) -> None:
+):
     """The job names no feature: a robust fit passes over a corner of 10 mm, and over what lies there.
 
     Nor is it gripped again.
@@ -234,12 +232,12 @@ def test_a_part_of_which_a_piece_broke_off_or_that_is_covered_is_told_though_the
     assert site.parts == [] and "of its face about" in why
 
 
-def test_another_part_or_none_is_not_found(lying_part: Lying) -> None:
+def test_another_part_or_none_is_not_found(lying_part: Lying):
     with pytest.raises(MisplacedError, match="is not where it was put down, or is not the part as drawn"):
         lying_part().looked(moved(0.05, 0.03, 0.02))
 
 
-def test_what_the_parts_faces_do_not_show_is_not_taken_as_seen(lying_part: Lying) -> None:
+def test_what_the_parts_faces_do_not_show_is_not_taken_as_seen(lying_part: Lying):
     site = lying_part(flat=True, verify="seen")
     found = site.looked(moved(0.2e-3, z=0.1e-3))
     assert any("not seen of the placed part: translation" in note for note in site.notes)
@@ -250,9 +248,7 @@ def test_what_the_parts_faces_do_not_show_is_not_taken_as_seen(lying_part: Lying
 
 
 @pytest.mark.parametrize("share", [0.002, 0.10])
-def test_steps_that_the_rail_lost_over_the_placed_part_are_found(
-    lying_part: Lying, monkeypatch: pytest.MonkeyPatch, share: float
-) -> None:
+def test_steps_that_the_rail_lost_over_the_placed_part_are_found(lying_part: Lying, monkeypatch, share: float):
     """Few show at the reference switch alone; many look like a part that moved."""
     monkeypatch.setattr(rail, "_LOST", share)
 
@@ -264,7 +260,7 @@ def test_steps_that_the_rail_lost_over_the_placed_part_are_found(
         lying_part(changed=lost).looked(moved())
 
 
-def test_a_sweep_over_the_part_that_lost_frames_is_done_again_twice(lying_part: Lying) -> None:
+def test_a_sweep_over_the_part_that_lost_frames_is_done_again_twice(lying_part: Lying):
     """It moves nothing of the part, so nobody has to come for that."""
     again = "the part is swept again"
 
@@ -278,7 +274,7 @@ def test_a_sweep_over_the_part_that_lost_frames_is_done_again_twice(lying_part: 
     assert sum(note.startswith(again) for note in site.notes) == 2
 
 
-def test_a_sweep_over_the_part_whose_replies_came_too_late_is_done_again(lying_part: Lying) -> None:
+def test_a_sweep_over_the_part_whose_replies_came_too_late_is_done_again(lying_part: Lying):
     def late(cell: VirtualCell) -> None:
         cell.rail.late = 0.05
 
@@ -300,15 +296,15 @@ def test_a_sweep_over_the_part_whose_replies_came_too_late_is_done_again(lying_p
 )
 def test_a_head_that_moved_after_the_sweep_is_neither_a_push_nor_a_part_that_lies_aside(
     lying_part: Lying, happened: Change, half: tuple[float, float], told: str
-) -> None:
+):
     site = lying_part(half=half, changed=lambda cell: happened(cell.world))
     with pytest.raises(MisplacedError, match=told):
         site.looked(moved())
 
 
 def test_a_laser_that_has_turned_since_the_calibration_leaves_open_no_more_than_one_that_has_not(
-    placed_pot: JobRecord, lying: tuple[PlacedPart, LyingPart], tmp_path: Path
-) -> None:
+    placed_pot: JobRecord, lying: tuple[PlacedPart, LyingPart], tmp_path
+):
     sweep = placed_pot.results["laser_sweep"]
     pointing = replace(sweep.pointing, turn=-0.25e-3)
     record = replace(placed_pot, results={**placed_pot.results, "laser_sweep": replace(sweep, pointing=pointing)})
@@ -319,9 +315,7 @@ def test_a_laser_that_has_turned_since_the_calibration_leaves_open_no_more_than_
     assert 0.01e-3 < before < 0.02e-3
 
 
-def test_a_part_whose_upper_side_lies_elsewhere_than_drawn_is_not_moved_by_it(
-    placed_pot: JobRecord, tmp_path: Path
-) -> None:
+def test_a_part_whose_upper_side_lies_elsewhere_than_drawn_is_not_moved_by_it(placed_pot: JobRecord, tmp_path):
     """Its underside lies where it belongs: what was seen of it would have it placed .3 mm aside."""
     aside, (job, mesh) = EFFECTS["upper side .3 mm aside in x"], load_job("pot")
     site = LyingPart(
@@ -342,7 +336,7 @@ def test_a_part_whose_upper_side_lies_elsewhere_than_drawn_is_not_moved_by_it(
         pytest.param(moved(z=-0.02e-3), id="sinks", marks=pytest.mark.campaign),
     ],
 )
-def test_a_part_that_does_not_come_to_rest_is_misplaced(lying_part: Lying, rate: pin.SE3) -> None:
+def test_a_part_that_does_not_come_to_rest_is_misplaced(lying_part: Lying, rate: pin.SE3):
     """At first each lies within its tolerances, and one sweep says no more."""
     site = lying_part(changed=lambda cell: creeps(cell, rate))
     with pytest.raises(MisplacedError, match="does not lie still: in the last of 3 sweeps to and fro") as met:
@@ -351,7 +345,7 @@ def test_a_part_that_does_not_come_to_rest_is_misplaced(lying_part: Lying, rate:
     assert sum("swept again: it moved by" in note for note in site.notes) == 2
 
 
-def test_a_part_that_comes_to_rest_is_swept_again_and_lies_where_the_last_sweep_saw_it(lying_part: Lying) -> None:
+def test_a_part_that_comes_to_rest_is_swept_again_and_lies_where_the_last_sweep_saw_it(lying_part: Lying):
     # It rides up the slopes of the surface, through which no part goes.
     rate = moved(0.02e-3, 0.03e-3, 0.015e-3, turn=(0.0, 0.0, 0.5e-3))
     site = lying_part(changed=lambda cell: creeps(cell, rate, 4.0))
@@ -360,7 +354,7 @@ def test_a_part_that_comes_to_rest_is_swept_again_and_lies_where_the_last_sweep_
     require_seen(found, site.lies())
 
 
-def test_a_vehicle_that_creeps_takes_part_and_surface_along(lying_part: Lying, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_vehicle_that_creeps_takes_part_and_surface_along(lying_part: Lying, monkeypatch):
     stands, rate = World.world_from_base, pin.Motion(np.array([8e-6, -9e-6, 5e-6, 4e-6, 6e-6, -9e-6]))
     monkeypatch.setattr(World, "world_from_base", lambda world, t: stands(world, t) @ pin.exp6(t * rate).homogeneous)
     site = lying_part()
@@ -368,7 +362,7 @@ def test_a_vehicle_that_creeps_takes_part_and_surface_along(lying_part: Lying, m
     assert not any("swept again" in note for note in site.notes)
 
 
-def test_a_job_looks_at_its_part_where_it_names_one_and_does_not_say_no(tmp_path: Path) -> None:
+def test_a_job_looks_at_its_part_where_it_names_one_and_does_not_say_no(tmp_path):
     job, _ = load_job("pot")
     assert kind_of(job) is PLACE
     for verify, looks in (("all", ["verify"]), ("seen", ["verify"]), ("none", [])):
@@ -377,12 +371,12 @@ def test_a_job_looks_at_its_part_where_it_names_one_and_does_not_say_no(tmp_path
     assert kind_of(load_job("load")[0]).names == (PLACE.names[0], "pick", *PLACE.names[1:], "verify")
 
 
-def test_what_is_accepted_is_no_farther_off_than_is_allowed(tmp_path: Path) -> None:
+def test_what_is_accepted_is_no_farther_off_than_is_allowed(tmp_path):
     with pytest.raises(ConfigError, match=r"accept 0\.7 mm is more than tolerance 0\.6 mm"):
         load_job(job_with_part(tmp_path, "pot", verify="all", also='accept = "0.7 mm"'))
 
 
-def test_a_run_tells_how_its_part_lies_in_report_page_and_picture_and_is_replayed(calibrated_folder: Path) -> None:
+def test_a_run_tells_how_its_part_lies_in_report_page_and_picture_and_is_replayed(calibrated_folder: Path):
     job = job_with_part(calibrated_folder, "pot", verify="all", half=MIDDLE)
     text = quick(job.read_text(encoding="utf-8"))
     job.write_text(
@@ -418,7 +412,7 @@ def test_a_run_tells_how_its_part_lies_in_report_page_and_picture_and_is_replaye
     assert (done.folder / "picture.png").is_file()
 
 
-def test_a_part_that_slips_as_the_claw_opens_ends_the_run_as_misplaced(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_a_part_that_slips_as_the_claw_opens_ends_the_run_as_misplaced(placed_pot: JobRecord, tmp_path):
     job, mesh = load_job(job_with_part(tmp_path, "pot", verify="all", half=MIDDLE))
     job = changed(job, "scan", speed=0.039)
     slips = opened(motion(y=0.9, turn=(0, 0, 4)))

@@ -32,17 +32,17 @@ def misplaced(
     return str(told.value)
 
 
-def test_a_part_that_comes_to_lie_beside_its_nest_is_misplaced(unloaded_part: JobRecord, tmp_path: Path) -> None:
+def test_a_part_that_comes_to_lie_beside_its_nest_is_misplaced(unloaded_part: JobRecord, tmp_path):
     told = misplaced(unloaded_part, tmp_path, moved(y=1.8e-3))
     assert "in axes of the arm base" in told and "mm off" in told
 
 
-def test_a_part_that_creeps_in_its_nest_is_misplaced(unloaded_part: JobRecord, tmp_path: Path) -> None:
+def test_a_part_that_creeps_in_its_nest_is_misplaced(unloaded_part: JobRecord, tmp_path):
     told = misplaced(unloaded_part, tmp_path, moved(), lambda cell: creeps(cell, moved(y=0.06e-3)))
     assert "does not lie still" in told
 
 
-def test_the_place_where_a_part_is_looked_at_is_its_own_or_the_nest() -> None:
+def test_the_place_where_a_part_is_looked_at_is_its_own_or_the_nest():
     pot, _ = load_job("pot")
     assert where_seen(pot) is pot
     assert JOB.nest is not None

@@ -38,9 +38,7 @@ def sigmas(covariance: np.ndarray) -> tuple[float, float]:
     ("found", "times"),
     [(None, 1.0), ((0.2, 0.5), 1.0), ((CHANCE_SCATTER - 0.05, 1.0), 1.0), ((2.0, 1.0), 2.0), ((0.5, 3.0), 3.0)],
 )
-def test_an_arm_scatters_as_configured_or_as_much_more_as_was_found(
-    found: tuple[float, float] | None, times: float
-) -> None:
+def test_an_arm_scatters_as_configured_or_as_much_more_as_was_found(found: tuple[float, float] | None, times: float):
     here = workplace(found)
     over_the_place = (JOB.approach.target.se3() * ARM.vehicle_from_base.se3()).translation
     over_the_board = CONFIG.calibration.fine.base_from_board.se3().translation

@@ -58,7 +58,7 @@ def looked(
     return look_again(site)
 
 
-def test_one_that_lies_where_it_lay_is_told_so(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_one_that_lies_where_it_lay_is_told_so(placed_pot: JobRecord, tmp_path):
     look = looked(placed_pot, tmp_path)
     found = look.moved
     assert look.notes == () and look.creep is None and not look.counted
@@ -79,8 +79,8 @@ def test_one_that_lies_where_it_lay_is_told_so(placed_pot: JobRecord, tmp_path: 
     ids=["along", "turned", "the vehicle was pushed", "far"],
 )
 def test_one_that_slid_over_its_table_is_refused(
-    placed_pot: JobRecord, tmp_path: Path, shift: tuple[float, float], turn: float, further: float
-) -> None:
+    placed_pot: JobRecord, tmp_path, shift: tuple[float, float], turn: float, further: float
+):
     with pytest.raises(RefusedError, match=r"run the job again") as refused:
         looked(placed_pot, tmp_path, shift, turn, further)
     (told,) = re.findall(
@@ -93,7 +93,7 @@ def test_one_that_slid_over_its_table_is_refused(
     assert number.value > number.most == 1.0
 
 
-def test_a_way_back_is_too_blunt_where_it_is_not_known_how_late_the_stamps_come(station: Station) -> None:
+def test_a_way_back_is_too_blunt_where_it_is_not_known_how_late_the_stamps_come(station: Station):
     site = station()
     site.work.looks_again = True
     assert site.do("laser_sweep").back is None
@@ -102,7 +102,7 @@ def test_a_way_back_is_too_blunt_where_it_is_not_known_how_late_the_stamps_come(
 @pytest.mark.parametrize(("shift", "late"), [(0.0, 0.0), (0.25e-3, 0.0), (0.25e-3, 6.0)])
 def test_the_way_back_of_a_sweep_is_its_second_look_unless_it_is_too_long_ago(
     station: Station, shift: float, late: float
-) -> None:
+):
     begun: list[str] = []
 
     def push(event: Event) -> None:
@@ -130,7 +130,7 @@ def test_the_way_back_of_a_sweep_is_its_second_look_unless_it_is_too_long_ago(
     assert begun
 
 
-def test_one_that_is_not_there_any_more_is_refused(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_one_that_is_not_there_any_more_is_refused(placed_pot: JobRecord, tmp_path):
     with pytest.raises(RefusedError, match="does not lie any more where it was swept"):
         looked(placed_pot, tmp_path, (0.0, 0.045))
 
@@ -143,9 +143,7 @@ def test_one_that_is_not_there_any_more_is_refused(placed_pot: JobRecord, tmp_pa
     ],
     ids=["limit", "setting"],
 )
-def test_a_camera_of_a_few_frame_rates_takes_all_lines_again(
-    station: Station, monkeypatch: pytest.MonkeyPatch, error: CellError
-) -> None:
+def test_a_camera_of_a_few_frame_rates_takes_all_lines_again(station: Station, monkeypatch, error: CellError):
     site = station()
     camera, rates = site.cell.scan_camera, []
     usual = camera.configure
@@ -163,7 +161,7 @@ def test_a_camera_of_a_few_frame_rates_takes_all_lines_again(
 
 def test_a_second_look_takes_few_lines_of_one_strip_twice_as_fast_where_there_is_room(
     placed_pot: JobRecord, station: Station
-) -> None:
+):
     workplace, (swath,) = station().work, placed_pot.results["laser_sweep"].swaths
     scan = workplace.job.scan
     few = sparse(workplace, scan.swath[0], swath)
@@ -178,7 +176,7 @@ def test_a_second_look_takes_few_lines_of_one_strip_twice_as_fast_where_there_is
     assert (by_arm.speed, by_arm.frame_rate) == (0.02, 5.0)
 
 
-def test_stamps_that_come_late_shift_the_faster_look_farther(station: Station) -> None:
+def test_stamps_that_come_late_shift_the_faster_look_farther(station: Station):
     site = station()
     sweep, workplace = site.made["laser_sweep"], site.work
     look_again(site)
@@ -196,7 +194,7 @@ def test_stamps_that_come_late_shift_the_faster_look_farther(station: Station) -
     assert spread[1] - spread[0] == pytest.approx((0.02 / math.sqrt(3.0) * faster) ** 2, rel=0.2)
 
 
-def test_a_look_that_loses_frames_tells_as_much(station: Station) -> None:
+def test_a_look_that_loses_frames_tells_as_much(station: Station):
     lost: list[int] = []
 
     def losing(event: Event) -> None:
@@ -209,7 +207,7 @@ def test_a_look_that_loses_frames_tells_as_much(station: Station) -> None:
     assert sum(lost) > MAX_LOST_FRACTION * LINES
 
 
-def test_what_late_replies_and_the_lines_leave_open_is_known(station: Station) -> None:
+def test_what_late_replies_and_the_lines_leave_open_is_known(station: Station):
     job, nominal = pot()
     site = station(changed(job, "place", tolerance=2e-3), nominal)
     site.do(*NAMES[1:-1])
@@ -232,7 +230,7 @@ def test_what_late_replies_and_the_lines_leave_open_is_known(station: Station) -
     assert re.search(r"translation along the x axis of the surface frame shows from 0\.\d+ mm on.* nobody touch", note)
 
 
-def test_what_late_replies_leave_open_lies_along_the_sweep_and_is_even(placed_pot: JobRecord) -> None:
+def test_what_late_replies_leave_open_lies_along_the_sweep_and_is_even(placed_pot: JobRecord):
     (swath,) = placed_pot.results["laser_sweep"].swaths
     along = 0.15e-3 * swath.builder.sweep_direction(swath.base_from_flange)
     expected = np.zeros((6, 6))
@@ -241,9 +239,7 @@ def test_what_late_replies_leave_open_lies_along_the_sweep_and_is_even(placed_po
 
 
 @pytest.mark.parametrize("photographed", [False, True])
-def test_after_a_pause_it_is_looked_at_anew(
-    station: Station, photographed: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_after_a_pause_it_is_looked_at_anew(station: Station, photographed: bool, monkeypatch):
     """Also after one within a look, before a photograph of the board that it takes after its sweep."""
     held: list[bool] = []
     if photographed:
@@ -265,9 +261,7 @@ def test_after_a_pause_it_is_looked_at_anew(
     assert held == [True]
 
 
-def test_a_few_steps_that_the_rail_lost_are_found_before_the_part_touches(
-    station: Station, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_few_steps_that_the_rail_lost_are_found_before_the_part_touches(station: Station, monkeypatch):
     """As few do not show in the lines: the count is looked at while the arm comes down."""
     heard: list[str] = []
     site = station(notify=lambda event: heard.append(str(event.data.get("text"))))
@@ -296,7 +290,7 @@ def compared(record: JobRecord, first: Cloud, second: Cloud) -> SurfaceMotion:
 
 
 @pytest.mark.parametrize(("every", "kept"), [(5, 1.0), (1, 0.01)], ids=["lines 5 mm apart", "few points in all"])
-def test_a_first_sweep_that_was_coarse_is_one_to_compare_with(placed_pot: JobRecord, every: int, kept: float) -> None:
+def test_a_first_sweep_that_was_coarse_is_one_to_compare_with(placed_pot: JobRecord, every: int, kept: float):
     cloud = placed_pot.results["reconstruct"].cloud
     first, second = lines_of(cloud, slice(0, None, every), kept), lines_of(cloud, slice(2, None, max(2, every)))
     found = compared(placed_pot, first, second)
@@ -304,7 +298,7 @@ def test_a_first_sweep_that_was_coarse_is_one_to_compare_with(placed_pot: JobRec
     assert np.linalg.norm(found.motion[:3]) < 0.1e-3
 
 
-def test_one_strip_of_several_is_held_against_itself(placed_pot: JobRecord) -> None:
+def test_one_strip_of_several_is_held_against_itself(placed_pot: JobRecord):
     cloud = placed_pot.results["reconstruct"].cloud
     aside = replace(cloud, points=cloud.points + np.array([0.0, 0.0, 0.3e-3]))
     strips = merge([cloud, aside])
@@ -313,7 +307,7 @@ def test_one_strip_of_several_is_held_against_itself(placed_pot: JobRecord) -> N
     assert strips.of_sweep(1).each_sweep() == [slice(0, cloud.shape[0])]
 
 
-def test_a_second_sweep_that_sees_nothing_says_so(placed_pot: JobRecord) -> None:
+def test_a_second_sweep_that_sees_nothing_says_so(placed_pot: JobRecord):
     nothing = lines_of(placed_pot.results["reconstruct"].cloud, slice(0, 30), 0.0)
     with pytest.raises(RefusedError, match=r"0 points were seen in 30 profiles .* gone, or the laser"):
         require_points(nothing)
@@ -323,9 +317,7 @@ def test_a_second_sweep_that_sees_nothing_says_so(placed_pot: JobRecord) -> None
 # --- what creeps ---
 
 
-def test_a_vehicle_that_creeps_is_seen_and_the_place_carried_on(
-    station: Station, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_vehicle_that_creeps_is_seen_and_the_place_carried_on(station: Station, monkeypatch):
     rate = np.array([2.2e-6, -6e-6, -4.8e-6, -3.8e-6, 2.8e-6, 1.8e-6])
     touched, stands = [], World.world_from_base
 
@@ -354,9 +346,7 @@ def test_a_vehicle_that_creeps_is_seen_and_the_place_carried_on(
     assert distance(placing.pose) < chi2.ppf(0.95, 6) < distance(record.results["invert_pose"])
 
 
-def test_a_place_that_creeps_is_carried_on_to_the_time_of_the_contact(
-    station: Station, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_place_that_creeps_is_carried_on_to_the_time_of_the_contact(station: Station, monkeypatch):
     site, until = station(), []
     monkeypatch.setattr(Creep, "carried", lambda creep, pose, time: until.append(time) or pose)
     site.work.pace.share = 0.5
@@ -367,7 +357,7 @@ def test_a_place_that_creeps_is_carried_on_to_the_time_of_the_contact(
     assert until == [pytest.approx(now + (place_step.APPROACH_S + descent) / 0.5)]
 
 
-def test_a_place_that_creeps_and_is_not_known_any_more_is_refused(station: Station) -> None:
+def test_a_place_that_creeps_and_is_not_known_any_more_is_refused(station: Station):
     site = station()
     made = [site.made[name] for name in ("laser_sweep", "reconstruct", "board_photo")]
     unknown = Creep(np.zeros(6), np.diag([30e-6**2] * 3 + [1e-12] * 3), np.zeros(3), float(made[0].times.mean()))

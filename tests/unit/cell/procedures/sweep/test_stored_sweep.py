@@ -49,7 +49,7 @@ def stored(taken: Swath) -> StoredSweep:
 
 
 @pytest.mark.parametrize("away", [0.0, 2.0])
-def test_a_sweep_holds_while_the_board_is_seen_where_it_was(stored: StoredSweep, away: float) -> None:
+def test_a_sweep_holds_while_the_board_is_seen_where_it_was(stored: StoredSweep, away: float):
     """`away` in standard deviations of the difference of two photographs."""
     confirmed = stored.confirmed_by(fix(BOARD * from_parts((away * np.sqrt(2) * SIGMA_M, 0.0, 0.0))))
     (before,), (after,) = stored.sweep.swaths, confirmed.swaths
@@ -58,14 +58,14 @@ def test_a_sweep_holds_while_the_board_is_seen_where_it_was(stored: StoredSweep,
 
 
 @pytest.mark.parametrize("way", [(7.0, 0, 0, 0, 0, 0), (0, 0, -7.0, 0, 0, 0), (0, 0, 0, 0, 7.0, 0)])
-def test_a_sweep_says_nothing_once_the_board_has_moved(stored: StoredSweep, way: tuple[float, ...]) -> None:
+def test_a_sweep_says_nothing_once_the_board_has_moved(stored: StoredSweep, way: tuple[float, ...]):
     step = np.sqrt(2) * np.array(way) * np.array([SIGMA_M] * 3 + [SIGMA_RAD] * 3)
     moved = pin.SE3(pin.exp3(step[3:]), step[:3])
     with pytest.raises(CalibrationStale, match="the board has moved by"):
         stored.confirmed_by(fix(BOARD * moved))
 
 
-def test_what_may_have_moved_unnoticed_reaches_the_flange_by_its_lever(stored: StoredSweep) -> None:
+def test_what_may_have_moved_unnoticed_reaches_the_flange_by_its_lever(stored: StoredSweep):
     """A turn of the station about the board's origin shifts a point elsewhere by turn × way: also with what sign."""
     (before,), (after,) = stored.sweep.swaths, stored.confirmed_by(fix(BOARD)).swaths
     way = before.base_from_flange.translation - BOARD.translation
@@ -76,7 +76,7 @@ def test_what_may_have_moved_unnoticed_reaches_the_flange_by_its_lever(stored: S
     assert after.covariance - before.covariance == pytest.approx(expected, rel=1e-9, abs=1e-18)
 
 
-def test_a_sweep_is_kept_with_what_was_seen_on_the_plate_before_it(stored: StoredSweep, tmp_path: Path) -> None:
+def test_a_sweep_is_kept_with_what_was_seen_on_the_plate_before_it(stored: StoredSweep, tmp_path):
     pointing, slip = Pointing(1e-4, 2e-5, 3e-5, 4e-5, 5e-5), Slip(1e-5, -2e-5, 3e-3, True, 0.08)
     save_sweep(tmp_path, replace(stored.sweep, pointing=pointing, slip=slip, doubts=("lost steps?",)), fix(BOARD))
     with np.load(tmp_path / FILE) as kept:
@@ -111,22 +111,18 @@ def begun(stored: StoredSweep, folder: Path, seen: pin.SE3, attempt: int) -> lis
     return [str(event.data.get("text")) for event in events]
 
 
-def test_an_earlier_sweep_is_not_taken_where_the_board_has_moved_but_swept_anew(
-    stored: StoredSweep, tmp_path: Path
-) -> None:
+def test_an_earlier_sweep_is_not_taken_where_the_board_has_moved_but_swept_anew(stored: StoredSweep, tmp_path):
     said = begun(stored, tmp_path, BOARD * from_parts((0.01, 0.0, 0.0)), 1)
     assert "the board has moved by 10.00 mm" in said[-1] and "sweeping again" in said[-1]
 
 
-def test_a_sweep_that_a_fault_ended_is_repeated_only_after_another_look_at_the_board(
-    stored: StoredSweep, tmp_path: Path
-) -> None:
+def test_a_sweep_that_a_fault_ended_is_repeated_only_after_another_look_at_the_board(stored: StoredSweep, tmp_path):
     assert begun(stored, tmp_path, BOARD, 2)[0] == "looking whether the board still stands where it did"
 
 
 def test_a_sweep_is_not_read_once_a_figure_was_edited_or_two_of_its_frames_are_exchanged(
-    taken: Swath, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    taken: Swath, tmp_path, monkeypatch
+):
     with FrameStore(tmp_path / "frames") as frames:
         for frame_id in taken.seen.tolist():
             frames.keep("stripe", Frame(np.full((9, 9), frame_id % 200, np.uint8), frame_id, 0.0, 0.0, 0.0, 0.0))
@@ -155,9 +151,7 @@ def test_a_sweep_is_not_read_once_a_figure_was_edited_or_two_of_its_frames_are_e
 
 
 @pytest.mark.parametrize("name", ["rail", "times", "flanges", "line_spread", "covariance"])
-def test_a_sweep_with_a_figure_that_is_no_number_is_refused_whoever_wrote_it(
-    taken: Swath, tmp_path: Path, name: str
-) -> None:
+def test_a_sweep_with_a_figure_that_is_no_number_is_refused_whoever_wrote_it(taken: Swath, tmp_path, name: str):
     values = getattr(taken, name).copy()
     values.flat[1] = np.nan
     save_sweep(tmp_path, SweepRecord((replace(taken, **{name: values}),)), fix(BOARD))
@@ -166,9 +160,7 @@ def test_a_sweep_with_a_figure_that_is_no_number_is_refused_whoever_wrote_it(
 
 
 @pytest.mark.parametrize("wrong", [np.zeros((6, 6)), -np.eye(6)], ids=["zero", "negative"])
-def test_a_sweep_whose_board_has_no_covariance_is_refused(
-    taken: Swath, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wrong: np.ndarray
-) -> None:
+def test_a_sweep_whose_board_has_no_covariance_is_refused(taken: Swath, tmp_path, monkeypatch, wrong: np.ndarray):
     save_sweep(tmp_path, SweepRecord((taken,)), replace(fix(BOARD), covariance=wrong))
     monkeypatch.setattr(stored_sweep, "_swath", lambda *given: taken)
     with pytest.raises(RefusedError, match="board_covariance"):

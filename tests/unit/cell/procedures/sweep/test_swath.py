@@ -6,7 +6,7 @@ import pytest
 from cell.procedures.sweep.swath import SweepErrors, TimeBound, shift_by_times, step_of_clock
 
 
-def test_only_what_pace_and_arrival_both_tell_is_a_step_of_the_clock() -> None:
+def test_only_what_pace_and_arrival_both_tell_is_a_step_of_the_clock():
     rng, numbers = np.random.default_rng(0), np.arange(100)
     true, late = 1e5 + numbers / 30.0, rng.exponential(0.004, 100)
     stepped = true + 0.012 * (numbers >= 60)
@@ -27,7 +27,7 @@ def test_only_what_pace_and_arrival_both_tell_is_a_step_of_the_clock() -> None:
     assert step_of_clock(numbers[:9], stepped[55:64], true[55:64]) == 0.0
 
 
-def test_what_times_leave_open_adds_up_for_the_shift_and_by_squares_for_its_variance() -> None:
+def test_what_times_leave_open_adds_up_for_the_shift_and_by_squares_for_its_variance():
     errors = SweepErrors(np.eye(6), 1e-5, 1e-4, late=2e-3)
     known = [TimeBound("rail", "rail", 1e-3), TimeBound("scan_camera", "camera", 2e-3)]
     assert shift_by_times(known, 0.01, errors) == pytest.approx((3e-5, 0.01**2 * (1e-6 + 4e-6 + 4e-6) / 3))

@@ -103,7 +103,7 @@ def lose(count: int) -> Meddle:
     return meddle
 
 
-def test_a_sweep_that_nothing_disturbed_knows_its_place_to_micrometres_and_has_a_picture_of_its_middle() -> None:
+def test_a_sweep_that_nothing_disturbed_knows_its_place_to_micrometres_and_has_a_picture_of_its_middle():
     swath = sweep()
     assert len(swath.lines) == pytest.approx(20, abs=2)
     assert swath.lost == 0
@@ -115,7 +115,7 @@ def test_a_sweep_that_nothing_disturbed_knows_its_place_to_micrometres_and_has_a
     assert len(taken) > 0.9 * frames
 
 
-def test_a_sweep_that_lasts_longer_than_the_laser_may_burn_unattended_keeps_it_lit() -> None:
+def test_a_sweep_that_lasts_longer_than_the_laser_may_burn_unattended_keeps_it_lit():
     slow = SCAN.model_copy(update={"speed": 0.0008, "frame_rate": 1.0})
     assert SCAN.length / slow.speed > UNATTENDED_S
     assert len(sweep(scan=slow).lines) == pytest.approx(25, abs=2)
@@ -138,7 +138,7 @@ class HomedEarlier:
         return self.bare.home()
 
 
-def test_a_zero_that_another_program_found_is_searched_again_before_a_sweep() -> None:
+def test_a_zero_that_another_program_found_is_searched_again_before_a_sweep():
     cell = VirtualCell(CONFIG, seed=4, level="ideal")
     cell.rail.home().wait(60.0)
     rail = HomedEarlier(cell.rail)
@@ -148,28 +148,28 @@ def test_a_zero_that_another_program_found_is_searched_again_before_a_sweep() ->
     assert rail.searched
 
 
-def test_a_rail_that_somebody_drives_slower_meanwhile_is_uneven() -> None:
+def test_a_rail_that_somebody_drives_slower_meanwhile_is_uneven():
     assert "off an even motion" in refused("rail.uneven_sweep", drive_the_rail_slower)
 
 
-def test_a_camera_whose_clock_is_set_meanwhile_is_a_fault() -> None:
+def test_a_camera_whose_clock_is_set_meanwhile_is_a_fault():
     told = refused("camera.clock_stepped", set_the_clock)
     (step,) = re.findall(r"stepped by about ([+-]\d+\.\d) ms", told)
     assert float(step) == pytest.approx(10.0, abs=4.0)
     assert len(sweep(lambda cell: set_the_clock(cell, 0.001)).lines) == pytest.approx(20, abs=2)
 
 
-def test_an_arm_that_is_pushed_meanwhile_is_a_fault() -> None:
+def test_an_arm_that_is_pushed_meanwhile_is_a_fault():
     assert "the flange moved by" in refused("arm.moved_in_sweep", push_the_arm)
 
 
-def test_more_lost_frames_than_a_twentieth_are_a_fault() -> None:
+def test_more_lost_frames_than_a_twentieth_are_a_fault():
     refused("camera.frames_lost", lose(2))
     assert sweep(lose(1)).lost == 1
 
 
 @pytest.mark.parametrize("late", [0.02, 0.2])
-def test_replies_that_are_all_late_are_refused_with_what_they_leave_open(late: float) -> None:
+def test_replies_that_are_all_late_are_refused_with_what_they_leave_open(late: float):
     said = refused("rail.late_readings", late=late)
     told = re.search(r"those of the rail to ±([\d.]+) ms", said)
     assert float(told[1]) == pytest.approx(0.5e3 * late, abs=0.25)
@@ -177,7 +177,7 @@ def test_replies_that_are_all_late_are_refused_with_what_they_leave_open(late: f
     assert "sweep more slowly" in said
 
 
-def test_lateness_that_is_allowed_is_in_the_budget() -> None:
+def test_lateness_that_is_allowed_is_in_the_budget():
     late = 0.01
     swath = sweep(late=late)
     # The trap: the readings show nothing of it, and the positions are off by half of it at 20 mm/s.
@@ -186,7 +186,7 @@ def test_lateness_that_is_allowed_is_in_the_budget() -> None:
     assert np.sqrt(np.trace(swath.covariance[:3, :3])) == pytest.approx(swath.shift / np.sqrt(3), rel=0.1)
 
 
-def test_a_camera_whose_clock_cannot_be_compared_well_is_refused_as_well() -> None:
+def test_a_camera_whose_clock_cannot_be_compared_well_is_refused_as_well():
     assert re.search(r"those of the camera to ±100\.\d ms", refused("camera.late_readings", camera_late=0.2))
 
 
@@ -217,7 +217,7 @@ def swept_by_arm(
     return swath, float(np.abs(swath.flanges[:, :3, 3] - truth).max())
 
 
-def test_a_sweep_that_nothing_disturbed_lies_where_it_says() -> None:
+def test_a_sweep_that_nothing_disturbed_lies_where_it_says():
     swath, off = swept_by_arm()
     assert len(swath.lines) == pytest.approx(20, abs=2)
     assert off < 10e-6
@@ -225,7 +225,7 @@ def test_a_sweep_that_nothing_disturbed_lies_where_it_says() -> None:
 
 
 @pytest.mark.parametrize("by_arm", [False, True])
-def test_the_laser_goes_off_before_a_camera_that_is_slow_to_end_its_stream(by_arm: bool) -> None:
+def test_the_laser_goes_off_before_a_camera_that_is_slow_to_end_its_stream(by_arm: bool):
     cell = VirtualCell(CONFIG, seed=4, level="ideal")
     cell.scan_camera.lingers = 2.0
     swath = swept_by_arm(made=cell)[0] if by_arm else sweep(made=cell)
@@ -233,7 +233,7 @@ def test_the_laser_goes_off_before_a_camera_that_is_slow_to_end_its_stream(by_ar
     assert not cell.world.laser.at(cell.clock.now() - 1.9)
 
 
-def test_an_arm_that_is_pushed_again_and_again_is_a_fault() -> None:
+def test_an_arm_that_is_pushed_again_and_again_is_a_fault():
     def push(arm: DirectArm) -> None:
         arm.model.drive.q[0] += 0.001
 
@@ -243,7 +243,7 @@ def test_an_arm_that_is_pushed_again_and_again_is_a_fault() -> None:
 
 
 @pytest.mark.parametrize("late", [0.02, 0.2])
-def test_states_that_are_all_late_are_refused_with_what_they_leave_open(late: float) -> None:
+def test_states_that_are_all_late_are_refused_with_what_they_leave_open(late: float):
     with pytest.raises(DeviceFault) as caught:
         swept_by_arm(late)
     assert caught.value.code == "arm.late_readings"
@@ -254,7 +254,7 @@ def test_states_that_are_all_late_are_refused_with_what_they_leave_open(late: fl
 
 
 @pytest.mark.parametrize("rate", [1.0, 3.0])
-def test_lateness_that_is_allowed_is_in_the_budget_by_the_arm(rate: float) -> None:
+def test_lateness_that_is_allowed_is_in_the_budget_by_the_arm(rate: float):
     late = 0.01
     swath, off = swept_by_arm(late, errors=replace(ERRORS, rate=rate))
     # The trap: the states lie on a perfect line, and the sweep is half of the lateness off.
@@ -267,7 +267,7 @@ def test_lateness_that_is_allowed_is_in_the_budget_by_the_arm(rate: float) -> No
     np.testing.assert_allclose(np.linalg.norm(swath.line_spread, axis=1), rate * JITTER_S * SCAN.speed)
 
 
-def test_a_run_is_held_before_rail_and_arm_move_together_and_not_meanwhile() -> None:
+def test_a_run_is_held_before_rail_and_arm_move_together_and_not_meanwhile():
     """Whoever is told that it is held may reach in."""
     cell, mover, pose = ready(None)
     rail, told = cell.devices.rail, list[str]()

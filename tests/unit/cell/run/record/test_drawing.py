@@ -17,7 +17,7 @@ from lab.bench.job.whole_job import JobRecord
 from tests.unit.cell.run.record.conftest import Messages
 
 
-def test_frames_lead_from_the_root_to_where_the_arm_itself_says_that_its_flange_is(read: Messages) -> None:
+def test_frames_lead_from_the_root_to_where_the_arm_itself_says_that_its_flange_is(read: Messages):
     """The arm computes its flange from its own table; the chain is the joints' through the product's kinematics."""
     chains = [(stamp, {t.child_frame_id: t for t in message.transforms}) for stamp, message in read["/tf"]]
     arms = {stamp: chain for stamp, chain in chains if "flange" in chain}
@@ -43,7 +43,7 @@ def matrix(transform: Any) -> np.ndarray[Any, Any]:
 
 def test_pictures_are_the_files_and_carry_the_lens_they_were_taken_with(
     read: Messages, folder: Path, placed_pot: JobRecord
-) -> None:
+):
     lenses = {"scan_camera": placed_pot.calibration.scan.camera, "target_camera": placed_pot.calibration.target.camera}
     kept = {path.name for path in (folder / "frames").iterdir()}
     for name, camera in lenses.items():
@@ -64,7 +64,7 @@ def test_pictures_are_the_files_and_carry_the_lens_they_were_taken_with(
     assert not kept
 
 
-def test_the_lines_and_all_of_them_are_the_cloud_of_the_run(read: Messages, folder: Path) -> None:
+def test_the_lines_and_all_of_them_are_the_cloud_of_the_run(read: Messages, folder: Path):
     stored = read_cloud(folder / "cloud.ply")
     measured = stored.points[~stored.interpolated].astype("<f4")
     told = sorted(read["/cloud/line"], key=itemgetter(0))
@@ -74,7 +74,7 @@ def test_the_lines_and_all_of_them_are_the_cloud_of_the_run(read: Messages, fold
     assert np.array_equal(np.frombuffer(whole.data, "<f4").reshape(-1, 3), measured)
 
 
-def test_the_clouds_points_lie_on_the_stripe_of_the_picture_taken_then(read: Messages) -> None:
+def test_the_clouds_points_lie_on_the_stripe_of_the_picture_taken_then(read: Messages):
     """Frames, lens, picture and cloud tell one story: by OpenCV's projection and the bright line in the picture."""
     poses, chain = [], {}
     for stamp, message in sorted(read["/tf"], key=itemgetter(0)):
@@ -113,7 +113,7 @@ def followed(chain: dict[str, Any], name: str, root: str) -> np.ndarray[Any, Any
     return pose
 
 
-def test_bodies_stand_in_frames_that_are_told_and_the_part_changes_hands(read: Messages) -> None:
+def test_bodies_stand_in_frames_that_are_told_and_the_part_changes_hands(read: Messages):
     frames = {"base", *(t.child_frame_id for _, message in read["/tf"] for t in message.transforms)}
     there: dict[str, str] = {}
     history = []
@@ -129,7 +129,7 @@ def test_bodies_stand_in_frames_that_are_told_and_the_part_changes_hands(read: M
     assert history[-1] == {"part": None, "placed part": "base", "surface": "base"}
 
 
-def test_rerun_sees_frames_lenses_pictures_and_cloud(folder: Path, tmp_path: Path) -> None:
+def test_rerun_sees_frames_lenses_pictures_and_cloud(folder: Path, tmp_path):
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
     command = Path(sys.executable).with_name("rerun")
     out = tmp_path / "record.rrd"

@@ -21,7 +21,7 @@ from drivers.vehicle.can_link import CanLink
 from tests.support import until
 
 
-def test_a_record_without_a_message_is_not_whole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_record_without_a_message_is_not_whole(tmp_path, capsys):
     path = tmp_path / "record.mcap"
     path.write_bytes(b"")
     assert not information(path)["whole"]
@@ -53,9 +53,7 @@ def raw(path: Path) -> list[tuple[str, int, bytes]]:
         return [(channel.topic, message.log_time, message.data) for _, channel, message in read]
 
 
-def test_a_record_cut_off_anywhere_is_closed_with_all_that_is_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_record_cut_off_anywhere_is_closed_with_all_that_is_whole(tmp_path, monkeypatch):
     monkeypatch.setattr(record_file, "CHUNK_BYTES", 700)
     put = written(tmp_path / "whole.mcap")
     data = (tmp_path / "whole.mcap").read_bytes()
@@ -72,7 +70,7 @@ def test_a_record_cut_off_anywhere_is_closed_with_all_that_is_whole(
         assert repair(cut).whole
 
 
-def test_a_flipped_bit_anywhere_is_named_and_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flipped_bit_anywhere_is_named_and_left_out(tmp_path, monkeypatch):
     monkeypatch.setattr(record_file, "CHUNK_BYTES", 700)
     put = written(tmp_path / "whole.mcap")
     assert information(tmp_path / "whole.mcap")["whole"]
@@ -100,7 +98,7 @@ def test_a_flipped_bit_anywhere_is_named_and_left_out(tmp_path: Path, monkeypatc
         (tmp_path / "record.mcap.damaged").unlink(missing_ok=True)
 
 
-def test_what_is_no_record_is_left_as_it_is(tmp_path: Path) -> None:
+def test_what_is_no_record_is_left_as_it_is(tmp_path):
     path = tmp_path / "record.mcap"
     path.write_bytes(b"SQLite format 3\0" * 10)
     with pytest.raises(CellError, match="does not begin as an MCAP file does"):
@@ -123,7 +121,7 @@ for k in range(10_000):
         print("on", flush=True)"""
 
 
-def test_a_process_that_is_killed_leaves_all_but_its_last_seconds(tmp_path: Path) -> None:
+def test_a_process_that_is_killed_leaves_all_but_its_last_seconds(tmp_path):
     path = tmp_path / "record.mcap"
     process = subprocess.Popen([sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE)
     assert process.stdout is not None and process.stdout.readline() == b"on\n"
@@ -171,7 +169,7 @@ def on_the_bus(path: Path) -> None:
     out.close()
 
 
-def test_can_traffic_comes_back_from_candumps_format_as_it_passed(tmp_path: Path) -> None:
+def test_can_traffic_comes_back_from_candumps_format_as_it_passed(tmp_path):
     on_the_bus(tmp_path / "record.mcap")
     assert as_candump(tmp_path / "record.mcap", tmp_path / "can.log") == 2 * len(FRAMES)
     with CanutilsLogReader(tmp_path / "can.log") as log:

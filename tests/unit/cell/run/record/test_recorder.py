@@ -22,7 +22,7 @@ from tests.support.report_runs import CONFIG
 from tests.unit.cell.run.record.conftest import Messages
 
 
-def test_the_libraries_own_reader_finds_every_channel_of_a_job_without_wires(read: Messages) -> None:
+def test_the_libraries_own_reader_finds_every_channel_of_a_job_without_wires(read: Messages):
     assert set(read) <= set(BY_TOPIC)
     wires = {"/vehicle/can", "/arm/rtde", "/rail/serial", "/laser/serial", "/claw/serial"}
     # Nobody asks the laser itself during a job.
@@ -34,7 +34,7 @@ def test_the_libraries_own_reader_finds_every_channel_of_a_job_without_wires(rea
     assert read["/record/end"] == [(read["/record/end"][0][0], {"dropped": {}, "cpu_s": None})]
 
 
-def test_times_are_the_virtual_clocks(read: Messages, placed_pot: JobRecord) -> None:
+def test_times_are_the_virtual_clocks(read: Messages, placed_pot: JobRecord):
     for stamp, frame in read["/scan_camera/frame"]:
         assert stamp == round(1e9 * (frame["host_time"] + 0.5 * frame["exposure"]))
     times = np.concatenate([swath.times for swath in placed_pot.results["laser_sweep"].swaths])
@@ -42,7 +42,7 @@ def test_times_are_the_virtual_clocks(read: Messages, placed_pot: JobRecord) -> 
     assert np.abs(np.array(lines) - np.sort(np.round(1e9 * times))).max() <= 1
 
 
-def test_the_sequence_its_commands_and_its_log_can_be_read_back(read: Messages) -> None:
+def test_the_sequence_its_commands_and_its_log_can_be_read_back(read: Messages):
     states = [message["to"] for _, message in read["/sequence/state"]]
     assert [*states[:3], states[-1]] == ["drive_to_target", "board_photo", "laser_sweep", "placed"]
     assert any(m["kind"] == "step_done" and m["step"] == "place" for _, m in read["/sequence/event"])
@@ -53,14 +53,14 @@ def test_the_sequence_its_commands_and_its_log_can_be_read_back(read: Messages) 
     assert {message.level for _, message in read["/log"]} <= {2, 3}
 
 
-def test_the_rails_readings_are_those_that_the_sweep_rests_on(read: Messages, placed_pot: JobRecord) -> None:
+def test_the_rails_readings_are_those_that_the_sweep_rests_on(read: Messages, placed_pot: JobRecord):
     (swath,) = placed_pot.results["laser_sweep"].swaths
     told = np.array([[m["stamp"], m["position"]] for _, m in read["/rail/state"]])
     told = told[np.argsort(told[:, 0], kind="stable")]
     assert np.abs(np.interp(swath.times, told[:, 0], told[:, 1]) - swath.rail).max() < 20e-6
 
 
-def test_a_configuration_can_do_without_records(tmp_path: Path) -> None:
+def test_a_configuration_can_do_without_records(tmp_path):
     quiet = CONFIG.model_copy(update={"cell": CONFIG.cell.model_copy(update={"record": False})})
     run: Run[None] = Run("jog", lambda run: None)
     with recorder.recorded(tmp_path, run, quiet, VirtualCell(CONFIG, 1, "ideal").devices) as record:
@@ -68,9 +68,7 @@ def test_a_configuration_can_do_without_records(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_the_packages_that_is_said_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_the_packages_that_is_said_once(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(record_file, "NEEDED", ("mcap", "no_such_package"))
     monkeypatch.setattr(recorder, "_said", set())
     cell = VirtualCell(CONFIG, 1, "ideal")
@@ -84,7 +82,7 @@ def test_without_the_packages_that_is_said_once(
         list(messages(Path(__file__), ("/",)))
 
 
-def test_a_recorder_that_fails_keeps_no_stop_and_no_command_from_passing(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_recorder_that_fails_keeps_no_stop_and_no_command_from_passing(caplog):
     devices = VirtualCell(CONFIG, 1, "ideal").devices
     broken = Mock(command=Mock(side_effect=OSError("no room")), reading=Mock(side_effect=OSError("no room")))
     for use in (devices.arm.state, devices.rail.stop):
@@ -94,7 +92,7 @@ def test_a_recorder_that_fails_keeps_no_stop_and_no_command_from_passing(caplog:
     assert sum("told nothing more" in line.getMessage() for line in caplog.records) == 2
 
 
-def test_what_passes_between_arm_and_driver_has_words() -> None:
+def test_what_passes_between_arm_and_driver_has_words():
     assert json.loads(rtde(True, b"\x00\x05O\x01")) == {"sent": True, "data": "00054f01"}
     assert json.loads(rtde(False, "stop")) == {"sent": False, "text": "stop"}
     told = json.loads(rtde(True, ("output", (3, True, np.array([1.5, math.nan])))))

@@ -32,7 +32,7 @@ REFUSALS: list[tuple[Make, str, str | None, bool, bool]] = [
 @pytest.mark.parametrize(("make", "step", "number", "frames", "cloud"), REFUSALS)
 def test_a_refusal_leaves_what_it_looked_at(
     ends: Ends, make: Make, step: str, number: str | None, frames: bool, cloud: bool
-) -> None:
+):
     run = ends(make)
     report = read_strictly(run.folder / "report.json")
     assert report["outcome"] == "refused"
@@ -53,25 +53,25 @@ def test_a_refusal_leaves_what_it_looked_at(
     assert cv2.imread(str(run.folder / "picture.png")).shape[1] > 1500
 
 
-def test_a_place_that_was_refused_is_shown_with_all_its_figures(ends: Ends) -> None:
+def test_a_place_that_was_refused_is_shown_with_all_its_figures(ends: Ends):
     report = ends(report_runs.other_surface).report
     names = {row["name"] for row in report["refusal"]["numbers"]}
     assert {"fit, χ²/dof", "surface covered", "points off the surface, RMS"} <= names
     assert report["place_pose"] is None
 
 
-def test_a_part_that_met_nothing_says_how_far_it_was_lowered(ends: Ends) -> None:
+def test_a_part_that_met_nothing_says_how_far_it_was_lowered(ends: Ends):
     (number,) = ends(report_runs.no_contact).report["refusal"]["numbers"]
     assert (number["name"], number["value"]) == ("reached without contact", pytest.approx(-1.0, abs=0.1))
 
 
-def test_a_photograph_is_kept_before_it_is_looked_at(ends: Ends) -> None:
+def test_a_photograph_is_kept_before_it_is_looked_at(ends: Ends):
     run = ends(report_runs.no_board)
     # One from where the vehicle started, one after it drove on odometry: neither showed the board of the job.
     assert [Path(name).name[:9] for name in run.report["refusal"]["frames"]] == ["board-01-", "board-02-"]
 
 
-def test_evidence_nearest_to_the_cause_stays() -> None:
+def test_evidence_nearest_to_the_cause_stays():
     error = RefusedError("too little", Measured("points", 3, least=5)).showing(
         Measured("points", 4, least=5), Measured("rms", 0.1, "mm", most=0.3), seen={"frame": 1}
     )
@@ -80,7 +80,7 @@ def test_evidence_nearest_to_the_cause_stays() -> None:
     assert (error.seen, str(error)) == ({"frame": 1, "pose": 3}, "too little")
 
 
-def test_a_fault_keeps_the_last_frames_and_every_fault_before_it(ends: Ends) -> None:
+def test_a_fault_keeps_the_last_frames_and_every_fault_before_it(ends: Ends):
     run = ends(report_runs.faulted)
     report = read_strictly(run.folder / "report.json")
     assert report["refusal"] is None
@@ -91,7 +91,7 @@ def test_a_fault_keeps_the_last_frames_and_every_fault_before_it(ends: Ends) -> 
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d{4}", first["at"])
 
 
-def test_a_placed_run_measures_itself_against_its_limits(ends: Ends) -> None:
+def test_a_placed_run_measures_itself_against_its_limits(ends: Ends):
     report = ends(report_runs.placed).report
     rows, truth = {row["name"]: row for row in report["measured"]}, report["truth"]
     assert all(row["kept"] for row in rows.values())
@@ -102,7 +102,7 @@ def test_a_placed_run_measures_itself_against_its_limits(ends: Ends) -> None:
     assert 0.5 < rows["fit, χ²/dof"]["value"] < 2.0
 
 
-def test_a_real_cell_has_its_own_figures(ends: Ends) -> None:
+def test_a_real_cell_has_its_own_figures(ends: Ends):
     report = ends(report_runs.real).report
     assert report["truth"] is None
     assert "; ".join(row["name"] for row in report["measured"][:5]) == (
@@ -111,7 +111,7 @@ def test_a_real_cell_has_its_own_figures(ends: Ends) -> None:
     )
 
 
-def test_a_surface_as_drawn_shows_no_waviness(ends: Ends) -> None:
+def test_a_surface_as_drawn_shows_no_waviness(ends: Ends):
     report = ends(report_runs.placed).report
     texture, row = report["scan"]["texture"], report["measured"][-2]
     assert (texture["sa_mm"], texture["sq_mm"], texture["sz_mm"]) == (None, None, None)
@@ -121,7 +121,7 @@ def test_a_surface_as_drawn_shows_no_waviness(ends: Ends) -> None:
     assert texture_words(report).startswith(f"no waviness told: {texture['reason']}; left: no waviness told: ")
 
 
-def test_waves_on_the_scanned_surface_are_told(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_waves_on_the_scanned_surface_are_told(placed_pot: JobRecord, tmp_path):
     def waved(cell: VirtualCell) -> None:
         drawing = cell.world.scene.drawing
         station = replace(drawing.station, waviness=(0.06e-3, 0.015, 0.25 * math.pi))
@@ -143,7 +143,7 @@ def test_waves_on_the_scanned_surface_are_told(placed_pot: JobRecord, tmp_path: 
     assert f"Waviness over 5 mm: Sa {texture['sa_mm']:.4f} mm, Sq {texture['sq_mm']:.4f} mm" in make_page(run.folder)
 
 
-def test_a_waviness_that_cannot_be_told_does_not_cost_the_report(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_a_waviness_that_cannot_be_told_does_not_cost_the_report(placed_pot: JobRecord, tmp_path):
     broken = replace(placed_pot.results["reconstruct"], by_poses=None)
     record = replace(placed_pot, results={**placed_pot.results, "reconstruct": broken})
     report = report_runs.placed(record, tmp_path / "runs").report

@@ -18,13 +18,13 @@ from tests.support.report_runs import Ends
 
 
 @pytest.fixture
-def folder(placed_pot: JobRecord, ends: Ends, tmp_path: Path) -> Path:
+def folder(placed_pot: JobRecord, ends: Ends, tmp_path) -> Path:
     shutil.copy(ends(report_runs.placed).folder / "report.json", tmp_path)
     write_cloud(tmp_path / "cloud.ply", placed_pot.results["reconstruct"].cloud)
     return tmp_path
 
 
-def test_points_and_deviations_are_those_of_the_run(folder: Path) -> None:
+def test_points_and_deviations_are_those_of_the_run(folder: Path):
     stored = read_cloud(folder / "cloud.ply").points
     for kind in ("ply", "mesh", "stl"):
         out = folder / f"out-{kind}{SUFFIXES[kind]}"
@@ -37,7 +37,7 @@ def test_points_and_deviations_are_those_of_the_run(folder: Path) -> None:
         assert abs(told["deviation_mm"]["mean"]) < told["deviation_mm"]["rms"] < told["deviation_mm"]["p95"] < 0.2
 
 
-def test_without_a_place_pose_there_is_no_deviation_and_an_unknown_job_is_asked_for(folder: Path) -> None:
+def test_without_a_place_pose_there_is_no_deviation_and_an_unknown_job_is_asked_for(folder: Path):
     report = json.loads((folder / "report.json").read_text())
     del report["sha256"]
     write_json(folder / "report.json", {**report, "place_pose": None})

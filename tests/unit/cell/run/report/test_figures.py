@@ -28,14 +28,14 @@ def shown(made: dict[str, Any], expected: dict[str, Any]) -> None:
     assert {name: made[name] for name in expected} == expected
 
 
-def test_a_photographs_figures(placed_pot: JobRecord) -> None:
+def test_a_photographs_figures(placed_pot: JobRecord):
     fix = replace(
         placed_pot.results["board_photo"], residual_px=0.12, obliquity=math.pi / 6, covariance=SPREAD, swung=0.02e-3
     )
     shown(fix.summary(), {"residual_px": 0.12, "obliquity_deg": 30.0, "swung_mm": 0.02, **SIGMAS})
 
 
-def test_an_arrivals_figures(placed_pot: JobRecord) -> None:
+def test_an_arrivals_figures(placed_pot: JobRecord):
     arrival = replace(
         placed_pot.results["drive_to_target"], error_along=3e-3, error_across=-2e-3, error_yaw=math.radians(0.5)
     )
@@ -46,7 +46,7 @@ def test_an_arrivals_figures(placed_pot: JobRecord) -> None:
     assert "3.0 mm along, -2.0 mm across and 0.50 deg" in still.words()
 
 
-def test_a_sweeps_figures(placed_pot: JobRecord) -> None:
+def test_a_sweeps_figures(placed_pot: JobRecord):
     sweep = placed_pot.results["laser_sweep"]
     (swath,) = sweep.swaths
     sweep = replace(
@@ -70,7 +70,7 @@ def test_a_sweeps_figures(placed_pot: JobRecord) -> None:
     assert "+0.200 ± 0.010 mrad" in sweep.pointing.words and "+0.150 mrad were seen" in sweep.pointing.words
 
 
-def test_a_clouds_and_a_places_figures(placed_pot: JobRecord) -> None:
+def test_a_clouds_and_a_places_figures(placed_pot: JobRecord):
     cloud = placed_pot.results["reconstruct"].cloud
     measured = int(np.isfinite(cloud.points[:, :, 0]).sum())
     shown(cloud.summary(), {
@@ -93,7 +93,7 @@ def test_a_clouds_and_a_places_figures(placed_pot: JobRecord) -> None:
     }  # fmt: skip
 
 
-def test_what_the_part_felt(placed_pot: JobRecord) -> None:
+def test_what_the_part_felt(placed_pot: JobRecord):
     touch = TouchCheck(TouchHeight(0.05e-3, 0.03e-3), TouchHeight(-0.01e-3, 0.04e-3))
     assert touch.as_dict() == {"felt_mm": 0.05, "expected_mm": -0.01, "off_mm": 0.06, "sigma_mm": 0.05}
     result = replace(placed_pot.results["place"], depth_error=-0.02e-3, touch=touch)
@@ -103,7 +103,7 @@ def test_what_the_part_felt(placed_pot: JobRecord) -> None:
     assert pin.exp3(told[3:]) == pytest.approx(result.base_from_flange.rotation, abs=1e-5)
 
 
-def test_what_is_known_of_times_and_of_the_laser() -> None:
+def test_what_is_known_of_times_and_of_the_laser():
     link = {"scan_camera.driver": "stream"}
     assert Shutter(0.5e-3, 0.01e-3, link).summary() == {"readout_ms": 0.5, "sigma_ms": 0.01}
     shown(StampTiming(1.5e-3, 0.05e-3, 8e-6, 1e-6, 0.4e-3, 0.02e-3, 0.25, 0.0, link).summary(), {
@@ -120,7 +120,7 @@ def test_what_is_known_of_times_and_of_the_laser() -> None:
     )
 
 
-def test_what_a_verification_suspects() -> None:
+def test_what_a_verification_suspects():
     change = np.zeros(27)
     change[:9] = 1.5, -1.0, 0.5, 0.25, 0.01, 0.02, 0.001, -0.002, 0.03
     change[9:21] = 1e-3 * np.arange(1, 13)
@@ -137,7 +137,7 @@ def test_what_a_verification_suspects() -> None:
     assert Figure("dots", 0.25, 0.125, "px").as_dict() == {"name": "dots", "value": 0.25, "sigma": 0.125, "unit": "px"}
 
 
-def test_a_calibrations_figures(placed_pot: JobRecord) -> None:
+def test_a_calibrations_figures(placed_pot: JobRecord):
     calibration = placed_pot.calibration
     told, scan = calibration.summary(), calibration.scan
     direction = scan.rail_direction

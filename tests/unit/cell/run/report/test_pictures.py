@@ -16,7 +16,7 @@ def surface_axes(panel: SurfacePanel, seams: list[dict[str, Any]]) -> tuple[Any,
     return axes, figure.axes[1]
 
 
-def test_the_map_of_deviations_has_a_fixed_scale_in_mm() -> None:
+def test_the_map_of_deviations_has_a_fixed_scale_in_mm():
     points = np.column_stack([*np.random.default_rng(1).uniform(-0.02, 0.02, (2, 4000)), np.zeros(4000)])
     for size in (1e-6, 1e-3):
         axes, colours = surface_axes(SurfacePanel(points, np.full(4000, size), believed=True), [])
@@ -26,7 +26,7 @@ def test_the_map_of_deviations_has_a_fixed_scale_in_mm() -> None:
         assert axes.get_xlabel().endswith("in mm")
 
 
-def test_a_surface_that_was_not_found_is_shown_by_its_height() -> None:
+def test_a_surface_that_was_not_found_is_shown_by_its_height():
     points = np.array([[0.0, 0.0, 0.001], [0.01, 0.0, 0.002]])
     axes, colours = surface_axes(SurfacePanel(points, None, believed=False), [])
     assert colours.get_ylabel() == "height in mm"
@@ -34,7 +34,7 @@ def test_a_surface_that_was_not_found_is_shown_by_its_height() -> None:
     surface_axes(SurfacePanel(points[:0], points[:0, 0], believed=True), [])
 
 
-def test_the_flush_of_a_placed_part_has_the_colours_of_the_map() -> None:
+def test_the_flush_of_a_placed_part_has_the_colours_of_the_map():
     points = np.column_stack([*np.random.default_rng(1).uniform(-0.02, 0.02, (2, 400)), np.zeros(400)])
     flush = Flush(points[:3], np.array([-0.1e-3, 0.0, 0.3e-3]), np.full(3, 0.05e-3))
     axes, _ = surface_axes(SurfacePanel(points, np.zeros(400), believed=True, flush=flush), [])

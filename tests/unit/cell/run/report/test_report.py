@@ -18,7 +18,7 @@ from tests.support.report_runs import Ended, Ends, pot, read_strictly
 DOCUMENT = ROOT / "docs" / "reference" / "report.md"
 
 
-def test_no_number_that_is_none_comes_into_the_report(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_no_number_that_is_none_comes_into_the_report(placed_pot: JobRecord, tmp_path):
     broken = replace(placed_pot.results["place"], depth_error=float("nan"))
     record = replace(placed_pot, results={**placed_pot.results, "place": broken})
     run = report_runs.real(record, tmp_path / "runs")
@@ -68,8 +68,8 @@ def in_two_sweeps(placed_pot: JobRecord, folder: Path) -> Ended:
 
 
 def test_every_key_of_a_report_is_documented_and_every_documented_key_exists(
-    ends: Ends, placed_pot: JobRecord, tmp_path: Path
-) -> None:
+    ends: Ends, placed_pot: JobRecord, tmp_path
+):
     made = (report_runs.placed, report_runs.too_strict, report_runs.faulted, report_runs.aborted)
     reports = [in_two_sweeps(placed_pot, tmp_path).report, *(ends(make).report for make in made)]
     found = set().union(*(keys(report) for report in reports))
@@ -99,14 +99,14 @@ def test_every_key_of_a_report_is_documented_and_every_documented_key_exists(
     assert documented() - found - parents - following == elsewhere
 
 
-def test_what_went_wrong_with_the_report_itself_is_told_in_it(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_what_went_wrong_with_the_report_itself_is_told_in_it(placed_pot: JobRecord, tmp_path):
     run = report_runs.crippled(placed_pot, tmp_path / "runs")
     assert {"frames_missing", "truth_missing", "picture_missing"} <= set(run.report)
     assert not (run.folder / "picture.png").is_symlink(), "the half of one was left"
     assert run.report["outcome"] == "placed"
 
 
-def test_the_report_keeps_its_contract(ends: Ends) -> None:
+def test_the_report_keeps_its_contract(ends: Ends):
     report = read_strictly(ends(report_runs.placed).folder / "report.json")
     assert {"outcome", "seed", "level", "steps", "place_pose", "place_sigma", "assumed_noise", "truth"} <= set(report)
     assert all({"name", "state", "duration_s", "retries", "wall_s"} <= set(step) for step in report["steps"])

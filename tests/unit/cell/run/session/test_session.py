@@ -21,14 +21,14 @@ from cell.run.session.session import kept_speed
     ],
 )
 @pytest.mark.usefixtures("here")
-def test_options_that_do_not_go_together_are_refused(options: dict[str, Any], says: str) -> None:
+def test_options_that_do_not_go_together_are_refused(options: dict[str, Any], says: str):
     Path("cell.toml").write_text(default_toml())
     with pytest.raises(ConfigError, match=says):
         Cell.open(**options)
 
 
 @pytest.mark.usefixtures("here")
-def test_the_supervisor_script_is_held_to_the_same() -> None:
+def test_the_supervisor_script_is_held_to_the_same():
     with pytest.raises(ConfigError, match="there is no cell"):
         Cell.open()
     Path("cell.toml").write_text(default_toml())
@@ -36,5 +36,5 @@ def test_the_supervisor_script_is_held_to_the_same() -> None:
         Cell.open()
 
 
-def test_a_slower_computer_keeps_a_slower_cell_and_never_one_slower_than_the_wall() -> None:
+def test_a_slower_computer_keeps_a_slower_cell_and_never_one_slower_than_the_wall():
     assert [kept_speed(1e-3 * took) for took in (2.0, 4.4, 6.6, 8.9, 60.0)] == [3.0, 3.0, 2.0, 1.5, 1.0]

@@ -4,7 +4,6 @@ import json
 import logging
 import os
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -23,13 +22,13 @@ from tests.unit.drivers.vehicle.test_agilex import Bench
 
 
 @pytest.fixture
-def cell(tmp_path: Path) -> Iterator[Cell]:
+def cell(tmp_path) -> Iterator[Cell]:
     made = Cell(OpenCell(CONFIG, tmp_path, CellLock(CONFIG), at_rest().devices, None))
     yield made
     made.close()
 
 
-def test_after_a_stop_a_script_begins_nothing_until_a_person_says_so(cell: Cell) -> None:
+def test_after_a_stop_a_script_begins_nothing_until_a_person_says_so(cell: Cell):
     rail, arm = cell.devices.rail, cell.devices.arm
     rail.move_to(0.01).wait(30.0)
     cell.stop()
@@ -49,7 +48,7 @@ def test_after_a_stop_a_script_begins_nothing_until_a_person_says_so(cell: Cell)
     assert rail.state().position == pytest.approx(0.02, abs=1e-6)
 
 
-def test_an_output_that_may_be_the_lasers_is_switched_off_after_a_stop_while_it_is_tried(cell: Cell) -> None:
+def test_an_output_that_may_be_the_lasers_is_switched_off_after_a_stop_while_it_is_tried(cell: Cell):
     """Where the numbers of laser and claw are swapped in the configuration, the claw's output lights the laser."""
     arm, claw = cell.devices.arm, CONFIG.claw.output
     with cell.maintenance("what hangs on which output", ["own_switch"]), cell.devices.interlocks.tried(claw):
@@ -60,7 +59,7 @@ def test_an_output_that_may_be_the_lasers_is_switched_off_after_a_stop_while_it_
     refused("after_a_stop", lambda: arm.set_digital_output(7, False), "clear_stop(by)")
 
 
-def test_an_output_that_is_tried_counts_as_a_lasers_for_the_arm_as_well(cell: Cell) -> None:
+def test_an_output_that_is_tried_counts_as_a_lasers_for_the_arm_as_well(cell: Cell):
     """A recovery switches off what may be a laser's, and leaves a claw's alone otherwise."""
     arm, claw = cell.devices.arm, CONFIG.claw.output
     with cell.maintenance("what hangs on which output", ["own_switch"]):
@@ -83,7 +82,7 @@ class ReadSlowly(os.PathLike[str]):
         return str(job_path("pot"))
 
 
-def test_a_stop_that_comes_while_work_is_prepared_is_not_lost(cell: Cell) -> None:
+def test_a_stop_that_comes_while_work_is_prepared_is_not_lost(cell: Cell):
     stood = cell.devices.arm.state().joints
     for begin in (lambda job: cell.calibrate(job=job), lambda job: jog(cell, parse_jog("arm", ["j1", "+5deg"]), job)):
         with pytest.raises(Aborted, match=r"was stopped before the .* began"):
@@ -95,14 +94,14 @@ def test_a_stop_that_comes_while_work_is_prepared_is_not_lost(cell: Cell) -> Non
     assert np.array_equal(cell.devices.arm.state().joints, stood)
 
 
-def test_work_outside_a_job_takes_the_vehicle_in_command_with_its_brake_locked(cell: Cell) -> None:
+def test_work_outside_a_job_takes_the_vehicle_in_command_with_its_brake_locked(cell: Cell):
     assert not cell.devices.vehicle.state().command_mode
     cell.home("arm")
     state = cell.devices.vehicle.state()
     assert (state.command_mode, state.braked) == (True, True)
 
 
-def test_a_recovery_opens_the_vehicles_bus_again(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recovery_opens_the_vehicles_bus_again(cell: Cell, monkeypatch):
     bench = Bench("recovery")
     try:
         monkeypatch.setattr(cell.devices, "_vehicle", bench.vehicle)
@@ -114,9 +113,7 @@ def test_a_recovery_opens_the_vehicles_bus_again(cell: Cell, monkeypatch: pytest
         bench.peer.stop()
 
 
-def test_maintenance_lifts_what_it_names_and_nothing_else_and_is_recorded(
-    cell: Cell, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_maintenance_lifts_what_it_names_and_nothing_else_and_is_recorded(cell: Cell, caplog):
     devices, away = cell.devices, HOME + 0.05
     devices.vehicle.enable()
     with caplog.at_level(logging.WARNING), cell.maintenance("the brake is being changed", lift=["vehicle_parked"]):
@@ -129,7 +126,7 @@ def test_maintenance_lifts_what_it_names_and_nothing_else_and_is_recorded(
     assert (report["maintenance"], report["lifted"]) == ("the brake is being changed", ["vehicle_parked"])
 
 
-def test_a_run_in_maintenance_says_so_in_its_report(cell: Cell) -> None:
+def test_a_run_in_maintenance_says_so_in_its_report(cell: Cell):
     with cell.maintenance("trial", lift=["own_switch"]):
         cell.home("rail")
     reports = [json.loads(path.read_text()) for path in cell.runs_folder.glob("*/report.json")]
@@ -139,7 +136,7 @@ def test_a_run_in_maintenance_says_so_in_its_report(cell: Cell) -> None:
 @pytest.mark.parametrize(
     "names", [["no_such_rule"], ["after_a_stop"], ["laser_attended"], ["way_clear", "same_kinematics"], []]
 )
-def test_only_rules_that_a_person_may_lift_are_lifted_and_only_for_a_reason(cell: Cell, names: list[str]) -> None:
+def test_only_rules_that_a_person_may_lift_are_lifted_and_only_for_a_reason(cell: Cell, names: list[str]):
     with pytest.raises(ConfigError), cell.maintenance("why not", lift=names):
         pass
     with pytest.raises(ConfigError, match="needs a reason"), cell.maintenance(" ", lift=["own_switch"]):
@@ -147,7 +144,7 @@ def test_only_rules_that_a_person_may_lift_are_lifted_and_only_for_a_reason(cell
     assert not list(cell.runs_folder.glob("*/report.json"))
 
 
-def test_jogs_keep_the_interlocks_and_home_makes_the_vehicle_free_to_drive(cell: Cell) -> None:
+def test_jogs_keep_the_interlocks_and_home_makes_the_vehicle_free_to_drive(cell: Cell):
     def jogged(device: str, *words: str) -> dict[str, str]:
         return jog(cell, parse_jog(device, list(words)))
 
@@ -165,7 +162,7 @@ def test_jogs_keep_the_interlocks_and_home_makes_the_vehicle_free_to_drive(cell:
 @pytest.mark.parametrize(("axis", "turn"), [("rx", (0.05, 0.0, 0.0)), ("rz", (0.0, 0.0, -0.05))])
 def test_a_jog_turns_the_flange_about_an_axis_of_the_base_where_it_stands(
     cell: Cell, axis: str, turn: tuple[float, ...]
-) -> None:
+):
     before = from_ur(cell.devices.arm.state().flange)
     jog(cell, parse_jog("arm", [axis, f"{sum(turn)} rad"]))
     after = from_ur(cell.devices.arm.state().flange)

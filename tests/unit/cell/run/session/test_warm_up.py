@@ -3,13 +3,12 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 
 @pytest.mark.campaign
-def test_what_a_first_job_compiles_was_compiled_ahead(tmp_path: Path) -> None:
+def test_what_a_first_job_compiles_was_compiled_ahead(tmp_path):
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
 
     def ours() -> set[str]:
@@ -27,7 +26,7 @@ def test_what_a_first_job_compiles_was_compiled_ahead(tmp_path: Path) -> None:
     assert {name.partition("-")[0] for name in ours() - before} <= {"follow._chain"}
 
 
-def test_who_compiles_ahead_ends_with_the_other(tmp_path: Path) -> None:
+def test_who_compiles_ahead_ends_with_the_other(tmp_path):
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     with subprocess.Popen(
         [sys.executable, "-m", "cell.run.session.warm_up"], stdin=subprocess.PIPE, env=environment

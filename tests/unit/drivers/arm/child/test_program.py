@@ -58,7 +58,7 @@ class Arm:
 
 
 @pytest.fixture
-def arm(monkeypatch: pytest.MonkeyPatch) -> Arm:
+def arm(monkeypatch) -> Arm:
     monkeypatch.setattr(program, "SETTLE_S", 0.1)
     monkeypatch.setattr(program, "BRAKING_S", 0.1)
     return Arm()
@@ -68,7 +68,7 @@ def near(snapshot: Snapshot) -> str:
     return joints_off(snapshot, STILL, "its target")
 
 
-def test_a_motion_has_arrived_when_the_arm_has_stood_at_its_target_for_a_moment(arm: Arm) -> None:
+def test_a_motion_has_arrived_when_the_arm_has_stood_at_its_target_for_a_moment(arm: Arm):
     begun = time.monotonic()
     assert arm.program.settled(near) == ("arrived", "")
     assert time.monotonic() - begun >= 0.02
@@ -76,24 +76,24 @@ def test_a_motion_has_arrived_when_the_arm_has_stood_at_its_target_for_a_moment(
 
 @pytest.mark.parametrize("joint", range(6))
 @pytest.mark.parametrize("off", [0.0025, -0.0025])
-def test_a_joint_beside_the_target_is_told_with_how_far(arm: Arm, joint: int, off: float) -> None:
+def test_a_joint_beside_the_target_is_told_with_how_far(arm: Arm, joint: int, off: float):
     aside = tuple(off * (k == joint) for k in range(6))
     arm.shows(joints=aside)
     how, text = arm.program.settled(near)
     assert (how, text) == ("arm.not_arrived", "a joint is 0.143 deg off its target")
 
 
-def test_an_arm_that_does_not_come_to_rest_at_its_target_has_not_arrived(arm: Arm) -> None:
+def test_an_arm_that_does_not_come_to_rest_at_its_target_has_not_arrived(arm: Arm):
     arm.shows(speeds=(0.0, 0.0, -0.01, 0.0, 0.0, 0.0))
     assert arm.program.settled(near) == ("arm.not_arrived", "the arm does not come to rest")
 
 
-def test_states_from_before_tell_of_no_arrival(arm: Arm) -> None:
+def test_states_from_before_tell_of_no_arrival(arm: Arm):
     arm.silent = True
     assert arm.program.settled(near)[0] == "arm.not_arrived"
 
 
-def test_the_watchdog_is_kept_quiet_only_while_the_arm_is_heard_and_its_program_runs(arm: Arm) -> None:
+def test_the_watchdog_is_kept_quiet_only_while_the_arm_is_heard_and_its_program_runs(arm: Arm):
     """Else a pulled cable would not stop it."""
     arm.program.kick()
     assert arm.library.kicks == 1
@@ -124,13 +124,13 @@ def test_the_watchdog_is_kept_quiet_only_while_the_arm_is_heard_and_its_program_
         ({"mode": 5}, "arm.not_powered"),
     ],
 )
-def test_what_keeps_the_arm_from_moving_is_named(arm: Arm, shown: dict[str, int], code: str | None) -> None:
+def test_what_keeps_the_arm_from_moving_is_named(arm: Arm, shown: dict[str, int], code: str | None):
     arm.shows(**shown)
     problem = arm.program.problem()
     assert (problem[0] if problem else None) == code
 
 
-def test_a_program_that_has_ended_is_told_with_its_cause_though_that_comes_later(arm: Arm) -> None:
+def test_a_program_that_has_ended_is_told_with_its_cause_though_that_comes_later(arm: Arm):
     arm.library.runs = False
     threading.Timer(0.03, lambda: arm.shows(safety_bits=1 << 2)).start()
     assert arm.program.problem() == ("arm.protective_stop", "")
@@ -139,7 +139,7 @@ def test_a_program_that_has_ended_is_told_with_its_cause_though_that_comes_later
     assert ControlProgram(SETUP, None, arm.latest).problem() == ("arm.program_stopped", "")
 
 
-def test_an_arm_has_been_stopped_when_it_shows_rest_after_it_was_told(arm: Arm) -> None:
+def test_an_arm_has_been_stopped_when_it_shows_rest_after_it_was_told(arm: Arm):
     assert arm.program.brake() is None
     assert arm.library.stops == 1
     arm.silent = True  # the rest that it showed is from before
@@ -157,7 +157,7 @@ def test_an_arm_has_been_stopped_when_it_shows_rest_after_it_was_told(arm: Arm) 
     ],
     ids=["moves", "moves though its program has ended", "paused"],
 )
-def test_an_arm_that_goes_on_or_may_go_on_is_not_stopped(arm: Arm, moving: dict[str, Any]) -> None:
+def test_an_arm_that_goes_on_or_may_go_on_is_not_stopped(arm: Arm, moving: dict[str, Any]):
     arm.shows(**moving)
     stopped = arm.program.brake()
     assert stopped is not None
@@ -180,6 +180,6 @@ def test_an_arm_that_goes_on_or_may_go_on_is_not_stopped(arm: Arm, moving: dict[
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, Exception) else "",
 )
-def test_what_an_error_means_for_a_run(error: Exception, outcome: Outcome, recoverable: bool, person: bool) -> None:
+def test_what_an_error_means_for_a_run(error: Exception, outcome: Outcome, recoverable: bool, person: bool):
     failure = classify(error)
     assert (failure.outcome, failure.recoverable, failure.needs_person) == (outcome, recoverable, person)

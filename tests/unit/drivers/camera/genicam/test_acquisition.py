@@ -13,14 +13,14 @@ from tests.support.wire.gige_bench import Bench
 pytestmark = pytest.mark.wire
 
 
-def test_block_ids_of_16_bits_begin_again_at_1() -> None:
+def test_block_ids_of_16_bits_begin_again_at_1():
     count = BlockCount()
     assert [count.of(block) for block in (65533, 65534, 65535, 1, 2, 5)] == [1, 2, 3, 4, 5, 8]
     long = BlockCount()
     assert [long.of(block) for block in (70_000, 70_001, 70_004)] == [1, 2, 5]
 
 
-def test_a_picture_out_of_turn_is_no_new_beginning_of_the_block_ids() -> None:
+def test_a_picture_out_of_turn_is_no_new_beginning_of_the_block_ids():
     count = BlockCount()
     assert [count.of(block) for block in (10, 12, 11, 13)] == [1, 3, 2, 4]
     around = BlockCount()
@@ -30,7 +30,7 @@ def test_a_picture_out_of_turn_is_no_new_beginning_of_the_block_ids() -> None:
 @pytest.mark.parametrize(
     "name", ["Mono8", "Mono10", "Mono10Packed", "Mono10p", "Mono12", "Mono12Packed", "Mono12p", "BayerRG8", "RGB8"]
 )
-def test_every_pixel_format_comes_as_the_grey_that_was_sent(bench: Bench, name: str) -> None:
+def test_every_pixel_format_comes_as_the_grey_that_was_sent(bench: Bench, name: str):
     camera = bench.open(pixel_format=name)
     camera.configure(0.004, 50.0)
     image = camera.grab().image
@@ -40,7 +40,7 @@ def test_every_pixel_format_comes_as_the_grey_that_was_sent(bench: Bench, name: 
     assert image[47, 63] == 200 or name == "BayerRG8"  # which mixes neighbours
 
 
-def test_lost_packets_come_again(bench: Bench) -> None:
+def test_lost_packets_come_again(bench: Bench):
     camera = bench.open(packet_size=576)
     camera.configure(0.004, 20.0)
     bench.peer.lose_packets(lambda number: number in (2, 3))
@@ -52,7 +52,7 @@ def test_lost_packets_come_again(bench: Bench) -> None:
     assert camera.statistics.errors["resent_packets"] >= 10
 
 
-def test_without_resending_a_picture_with_a_hole_is_lost_and_never_handed_out(bench: Bench) -> None:
+def test_without_resending_a_picture_with_a_hole_is_lost_and_never_handed_out(bench: Bench):
     camera = bench.open(packet_size=576, resend=False, retention=0.05)
     camera.configure(0.004, 20.0)
     lose = iter([True, False, True] + [False] * 1000)
@@ -68,7 +68,7 @@ def test_without_resending_a_picture_with_a_hole_is_lost_and_never_handed_out(be
     assert caught.value.code == "camera.packets_lost"
 
 
-def test_lost_exposures_are_known_from_the_block_ids(bench: Bench) -> None:
+def test_lost_exposures_are_known_from_the_block_ids(bench: Bench):
     camera = bench.open()
     camera.configure(0.002, 100.0)
     with camera.stream() as frames:
@@ -80,7 +80,7 @@ def test_lost_exposures_are_known_from_the_block_ids(bench: Bench) -> None:
     assert frames.lost == 3
 
 
-def test_who_ends_an_acquisition_does_not_wait_for_a_silent_camera(bench: Bench) -> None:
+def test_who_ends_an_acquisition_does_not_wait_for_a_silent_camera(bench: Bench):
     camera = bench.open()
     camera.configure(0.004, 50.0)
     with pytest.raises(DeadlineError) as caught, camera.stream() as frames:
@@ -95,7 +95,7 @@ def test_who_ends_an_acquisition_does_not_wait_for_a_silent_camera(bench: Bench)
     camera.close()
 
 
-def test_packed_pixels_are_read_as_the_standards_lay_them_out() -> None:
+def test_packed_pixels_are_read_as_the_standards_lay_them_out():
     first, second, third, fourth = 0b1011001110, 0b0100110001, 0b1111000010, 0b0000111101
     gige10 = bytes([first >> 2, (second & 3) << 4 | first & 3, second >> 2])
     gige12 = bytes([0xAB, 0x6 << 4 | 0xC, 0xDE])  # 0xABC and 0xDE6
@@ -113,7 +113,7 @@ def test_packed_pixels_are_read_as_the_standards_lay_them_out() -> None:
 
 
 @pytest.mark.parametrize(("name", "tile"), [("RG", "RGGB"), ("GR", "GRBG"), ("GB", "GBRG"), ("BG", "BGGR")])
-def test_each_bayer_pattern_gives_the_grey_of_its_colours(name: str, tile: str) -> None:
+def test_each_bayer_pattern_gives_the_grey_of_its_colours(name: str, tile: str):
     colour = {"R": 200, "G": 120, "B": 40}
     raw = np.tile(np.array([colour[c] for c in tile], np.uint8).reshape(2, 2), (8, 8))
     grey = FORMATS[f"Bayer{name}8"].grey(raw.reshape(-1), 16, 16)

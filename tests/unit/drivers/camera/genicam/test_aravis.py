@@ -40,7 +40,7 @@ class TestContract(CameraContract):
             yield made
             made.over()
 
-    def test_a_stream_comes_in_order_at_its_rate_and_knows_its_losses(self, bench: Bench[Camera]) -> None:
+    def test_a_stream_comes_in_order_at_its_rate_and_knows_its_losses(self, bench: Bench[Camera]):
         """Its first picture comes at once, off its grid, and the others as well as it is run: it has no other clock."""
         camera = bench.device
         camera.configure(EXPOSURE_S, RATE_HZ)
@@ -55,7 +55,7 @@ class TestContract(CameraContract):
         assert periods.min() > 0.5 and periods.max() < 2.5
         assert [frame.received for frame in made] == sorted(frame.received for frame in made)
 
-    def test_a_trigger_tells_the_time_of_a_picture_that_comes_unchanged(self, bench: Bench[Camera]) -> None:
+    def test_a_trigger_tells_the_time_of_a_picture_that_comes_unchanged(self, bench: Bench[Camera]):
         """Its clock has no latch: the exposure lay between the trigger and the picture, and that bounds the time."""
         camera = bench.device
         camera.configure(EXPOSURE_S, RATE_HZ)

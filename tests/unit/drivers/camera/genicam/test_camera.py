@@ -9,7 +9,7 @@ from tests.support.wire.gige_bench import Bench
 pytestmark = pytest.mark.wire
 
 
-def test_times_are_those_that_the_pictures_show(bench: Bench) -> None:
+def test_times_are_those_that_the_pictures_show(bench: Bench):
     camera = bench.open()
     camera.configure(0.004, 50.0)
     called = bench.clock.now()
@@ -24,7 +24,7 @@ def test_times_are_those_that_the_pictures_show(bench: Bench) -> None:
     assert np.diff([frame.host_time for frame in made]) == pytest.approx(np.full(19, 0.02), abs=1e-5)
 
 
-def test_region_gain_and_packet_size_are_set(bench: Bench) -> None:
+def test_region_gain_and_packet_size_are_set(bench: Bench):
     camera = bench.open(width=32, height=16, offset=(32, 32), gain=6.0206, packet_size=576)
     camera.configure(0.004, 50.0)
     image = camera.grab().image
@@ -33,7 +33,7 @@ def test_region_gain_and_packet_size_are_set(bench: Bench) -> None:
     assert (image[0, 0], image[15, 31]) == (200, 255)
 
 
-def test_what_the_camera_has_not_is_refused_with_what_it_has(bench: Bench) -> None:
+def test_what_the_camera_has_not_is_refused_with_what_it_has(bench: Bench):
     with pytest.raises(LimitError, match=r"Width 80 is none .*allowed: 16 to 64 in steps of 1"):
         bench.open(width=80)
     with pytest.raises(LimitError, match="OffsetX 80 is none"):
@@ -45,7 +45,7 @@ def test_what_the_camera_has_not_is_refused_with_what_it_has(bench: Bench) -> No
     bench.open().close()
 
 
-def test_a_line_triggers_streams_and_photographs(bench: Bench) -> None:
+def test_a_line_triggers_streams_and_photographs(bench: Bench):
     camera = bench.open(trigger="line")
     camera.configure(0.004, 50.0)
     with camera.stream() as frames:
@@ -58,7 +58,7 @@ def test_a_line_triggers_streams_and_photographs(bench: Bench) -> None:
     camera.close()
 
 
-def test_a_photograph_can_come_from_a_free_run(bench: Bench) -> None:
+def test_a_photograph_can_come_from_a_free_run(bench: Bench):
     camera = bench.open(trigger="free")
     camera.configure(0.004, 20.0)
     called = bench.clock.now()
@@ -66,9 +66,7 @@ def test_a_photograph_can_come_from_a_free_run(bench: Bench) -> None:
     camera.close()
 
 
-def test_a_free_run_whose_stamps_lie_before_every_question_ends_in_time(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_free_run_whose_stamps_lie_before_every_question_ends_in_time(bench: Bench, monkeypatch):
     camera = bench.open(trigger="free")
     camera.configure(0.004, 20.0)
     behind = camera._stamps.host_time

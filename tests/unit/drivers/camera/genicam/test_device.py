@@ -11,7 +11,7 @@ from tests.support.wire.gige_bench import SPEC, Bench, opened, require_aravis, s
 pytestmark = pytest.mark.wire
 
 
-def test_stamps_that_are_none_of_the_exposure_are_refused() -> None:
+def test_stamps_that_are_none_of_the_exposure_are_refused():
     with served(replace(SPEC, latency=-0.2)) as bench:
         camera = bench.open()
         camera.configure(0.004, 50.0)
@@ -21,7 +21,7 @@ def test_stamps_that_are_none_of_the_exposure_are_refused() -> None:
     assert caught.value.code == "camera.clock"
 
 
-def test_stamps_that_lie_in_the_future_end_a_stream() -> None:
+def test_stamps_that_lie_in_the_future_end_a_stream():
     """As after a time service has set the camera's clock: nothing of it may be paired with the rail."""
     with served(replace(SPEC, latency=0.2)) as bench:
         camera = bench.open()
@@ -32,7 +32,7 @@ def test_stamps_that_lie_in_the_future_end_a_stream() -> None:
     assert caught.value.code == "camera.clock"
 
 
-def test_another_application_that_holds_the_camera_is_named(bench: Bench) -> None:
+def test_another_application_that_holds_the_camera_is_named(bench: Bench):
     first = bench.open()
     with pytest.raises(DeviceFault, match=r"another application on 127\.\S+ holds the camera") as caught:
         bench.open()
@@ -49,7 +49,7 @@ def test_another_application_that_holds_the_camera_is_named(bench: Bench) -> Non
     bench.open().close()
 
 
-def test_a_lost_link_is_told_and_the_camera_is_used_again_when_it_is_back(bench: Bench) -> None:
+def test_a_lost_link_is_told_and_the_camera_is_used_again_when_it_is_back(bench: Bench):
     camera = bench.open()
     camera.configure(0.004, 50.0)
     with camera.stream() as frames:
@@ -67,7 +67,7 @@ def test_a_lost_link_is_told_and_the_camera_is_used_again_when_it_is_back(bench:
     camera.close()
 
 
-def test_a_silent_camera_is_a_deadline_and_is_used_again(bench: Bench) -> None:
+def test_a_silent_camera_is_a_deadline_and_is_used_again(bench: Bench):
     camera = bench.open()
     camera.configure(0.004, 50.0)
     with camera.stream() as frames:
@@ -82,7 +82,7 @@ def test_a_silent_camera_is_a_deadline_and_is_used_again(bench: Bench) -> None:
     camera.close()
 
 
-def test_another_camera_at_the_address_is_not_taken_for_the_lost_one() -> None:
+def test_another_camera_at_the_address_is_not_taken_for_the_lost_one():
     with served() as bench:
         camera = bench.open()
         host = bench.peer.address
@@ -95,7 +95,7 @@ def test_another_camera_at_the_address_is_not_taken_for_the_lost_one() -> None:
         camera.close()
 
 
-def test_an_address_without_a_camera_is_named_with_a_remedy() -> None:
+def test_an_address_without_a_camera_is_named_with_a_remedy():
     require_aravis()
     with pytest.raises(NotConnectedError, match=r"127\.1\.255\.254.*Remedy: check power and cable"):
         opened("127.1.255.254", Clock())

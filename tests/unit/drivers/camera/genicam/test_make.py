@@ -1,7 +1,5 @@
 """Promises of `drivers.camera.genicam.make`."""
 
-from pathlib import Path
-
 import pytest
 
 from cell.config.cell_config import load_config
@@ -25,12 +23,12 @@ from tests.support.wire.cells import named
         ("v4l2", 'device = "video0"', "device"),
     ],
 )
-def test_the_makes_values_are_checked(tmp_path: Path, driver: str, address: str, words: str) -> None:
+def test_the_makes_values_are_checked(tmp_path, driver: str, address: str, words: str):
     with pytest.raises(ConfigError, match=words):
         load_config(named(tmp_path, driver, address))
 
 
-def test_a_region_changes_what_a_calibration_fits_and_an_address_does_not(tmp_path: Path) -> None:
+def test_a_region_changes_what_a_calibration_fits_and_an_address_does_not(tmp_path):
     def hash_of(address: str) -> str:
         return load_config(named(tmp_path, "gige", address)).calibration_hash()
 
@@ -40,9 +38,7 @@ def test_a_region_changes_what_a_calibration_fits_and_an_address_does_not(tmp_pa
     assert hash_of('address = "192.0.2.20"\noffset = [16, 0]') != own
 
 
-def test_without_aravis_its_makes_are_listed_as_not_installed_with_the_remedy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_aravis_its_makes_are_listed_as_not_installed_with_the_remedy(tmp_path, monkeypatch):
     monkeypatch.setattr(aravis, "LIBRARIES", ("libaravis-none.so",))
     aravis.load.cache_clear()
     try:

@@ -15,7 +15,7 @@ from tests.support.wire.modbus_bench import Drive, config
 pytestmark = pytest.mark.wire
 
 
-def test_numbers_whose_words_come_in_the_other_order_end_the_first_motion_at_its_first_reading(drive: Drive) -> None:
+def test_numbers_whose_words_come_in_the_other_order_end_the_first_motion_at_its_first_reading(drive: Drive):
     """Whatever is written reads back, 0 is 0 in either order, and the drive runs off the other way."""
     other = replace(drive, record=config({**PATHS, "word_order": "low first"}))
     rail = other.homed()
@@ -29,7 +29,7 @@ def test_numbers_whose_words_come_in_the_other_order_end_the_first_motion_at_its
     rail.close()
 
 
-def test_a_drive_that_takes_its_speed_in_another_unit_is_told_as_too_fast(drive: Drive) -> None:
+def test_a_drive_that_takes_its_speed_in_another_unit_is_told_as_too_fast(drive: Drive):
     """30 rpm for the configuration, in tenths: written as 300, taken by the drive as 300 rpm."""
     other = replace(drive, record=config({**PATHS, "speed": {"address": 0x6203, "unit": "0.1 rpm"}}))
     rail = other.homed()
@@ -39,7 +39,7 @@ def test_a_drive_that_takes_its_speed_in_another_unit_is_told_as_too_fast(drive:
     rail.close()
 
 
-def test_a_zero_that_another_program_found_is_not_this_ones(drive: Drive) -> None:
+def test_a_zero_that_another_program_found_is_not_this_ones(drive: Drive):
     drive.homed().close()
     rail = drive.rail()
     assert (rail.state().homed, rail.state().homed_here) == (True, False)
@@ -51,14 +51,14 @@ def test_a_zero_that_another_program_found_is_not_this_ones(drive: Drive) -> Non
     rail.close()
 
 
-def test_a_search_at_the_drives_own_speed_is_slower_than_the_rail_may_go(drive: Drive) -> None:
+def test_a_search_at_the_drives_own_speed_is_slower_than_the_rail_may_go(drive: Drive):
     rail = drive.homed()
     rail.move_to(0.095).wait(60.0)
     rail.close()
     drive.homed(max_speed=2.0).close()
 
 
-def test_a_drive_that_does_not_begin_to_search_is_not_homed(drive: Drive) -> None:
+def test_a_drive_that_does_not_begin_to_search_is_not_homed(drive: Drive):
     drive.homed().close()
     deaf = config({**PATHS, "home": {"address": 0x6002, "value": 0x77}})
     rail = drive.rail(registers=deaf.registers)
@@ -86,7 +86,7 @@ def edges() -> Iterator[Drive]:
     made.peer.stop()
 
 
-def test_what_speaks_against_a_zero_when_nobody_watched_ends_the_trust_in_it(edges: Drive) -> None:
+def test_what_speaks_against_a_zero_when_nobody_watched_ends_the_trust_in_it(edges: Drive):
     drive = edges
     drive.homed().close()
     for name in ("stalled", "left_switch", "right_switch"):
@@ -102,7 +102,7 @@ def test_what_speaks_against_a_zero_when_nobody_watched_ends_the_trust_in_it(edg
     rail.close()
 
 
-def test_a_search_that_ends_elsewhere_in_an_alarm_or_by_a_stop_finds_no_zero(edges: Drive) -> None:
+def test_a_search_that_ends_elsewhere_in_an_alarm_or_by_a_stop_finds_no_zero(edges: Drive):
     drive, rail = edges, edges.rail()
     true, off = drive.model.position, round(0.002 / drive.record.lead * drive.record.counts_per_turn)
     with shown(drive.model, "position", lambda t: true(t) + off):
@@ -120,7 +120,7 @@ def test_a_search_that_ends_elsewhere_in_an_alarm_or_by_a_stop_finds_no_zero(edg
     rail.close()
 
 
-def test_an_obstacle_is_an_alarm_with_its_number() -> None:
+def test_an_obstacle_is_an_alarm_with_its_number():
     drive = Drive.of(config(PATHS, travel=["0 mm", "120 mm"]))
     rail = drive.homed()
     drive.model.configure(drive.clock.now(), replace(drive.model.settings, right_stop=False))

@@ -21,13 +21,13 @@ from tests.support.modbus_maps import PATHS
 from tests.support.wire.modbus_bench import UNIT, Drive, config
 
 
-def test_frames_carry_the_checksum_that_pymodbus_computes() -> None:
+def test_frames_carry_the_checksum_that_pymodbus_computes():
     for frame in (bytes(range(n)) for n in range(2, 40)):
         assert modbus_link._crc(frame) == FramerRTU.compute_CRC(frame).to_bytes(2, "big")
 
 
 @pytest.mark.wire
-def test_a_line_that_repeats_what_is_sent_is_noticed() -> None:
+def test_a_line_that_repeats_what_is_sent_is_noticed():
     drive = Drive.of(config(PATHS), echo=True)
     rail = drive.homed()
     rail.move_to(0.005).wait(30.0)
@@ -37,7 +37,7 @@ def test_a_line_that_repeats_what_is_sent_is_noticed() -> None:
 
 
 @pytest.mark.wire
-def test_a_lost_reply_is_asked_for_again_and_a_silent_drive_is_told_with_what_to_check(drive: Drive) -> None:
+def test_a_lost_reply_is_asked_for_again_and_a_silent_drive_is_told_with_what_to_check(drive: Drive):
     rail = drive.homed()
     drive.peer.fault("rail.drop_reply")
     assert rail.state().homed
@@ -80,7 +80,7 @@ def reply(address: int, count: int, unit: int = UNIT, function: int = 3) -> byte
 
 @pytest.mark.wire
 @pytest.mark.parametrize("late", [0.2, 0.4, 0.6])
-def test_late_answers_never_become_those_to_later_questions(late: float) -> None:
+def test_late_answers_never_become_those_to_later_questions(late: float):
     """Two replies are late, those behind them come at once after them; a drive that reads two registers at a time."""
     asked = itertools.count()
 
@@ -100,7 +100,7 @@ def test_late_answers_never_become_those_to_later_questions(late: float) -> None
 
 @pytest.mark.wire
 @pytest.mark.parametrize("spoilt", ["a bit", "another drive's", "another function's"])
-def test_a_reply_that_is_spoilt_or_anothers_is_asked_for_again(spoilt: str) -> None:
+def test_a_reply_that_is_spoilt_or_anothers_is_asked_for_again(spoilt: str):
     asked = itertools.count()
 
     def answer(address: int, count: int) -> bytes:
@@ -118,7 +118,7 @@ def test_a_reply_that_is_spoilt_or_anothers_is_asked_for_again(spoilt: str) -> N
 
 
 @pytest.mark.wire
-def test_a_register_that_the_drive_does_not_have_is_named() -> None:
+def test_a_register_that_the_drive_does_not_have_is_named():
     wrong = {**PATHS, "homed": {"address": 0x1004, "bit": 6}}
     drive = Drive.of(config(PATHS))
     with pytest.raises(ModbusRefused, match="register 0x1004: it has no such register"):
@@ -127,7 +127,7 @@ def test_a_register_that_the_drive_does_not_have_is_named() -> None:
 
 
 @pytest.mark.wire
-def test_what_was_decided_before_a_stop_is_not_sent_after_it(drive: Drive) -> None:
+def test_what_was_decided_before_a_stop_is_not_sent_after_it(drive: Drive):
     rail = drive.homed()
     decided = rail._link.stops.count
     rail.stop()

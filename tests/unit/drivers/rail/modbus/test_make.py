@@ -13,7 +13,7 @@ from tests.support.wire.modbus_bench import config
 from tests.support.wire.other_makes import LCUS, MODBUS, ROBOTIQ, cell
 
 
-def test_a_rail_of_another_make_is_another_configuration_for_a_calibration_and_another_switch_is_none() -> None:
+def test_a_rail_of_another_make_is_another_configuration_for_a_calibration_and_another_switch_is_none():
     """What positions mean hangs on the rail's map, where the light plane lies does not hang on the laser's switch."""
     stock = load_config(None).calibration_hash()
     with_drive = cell(MODBUS).calibration_hash()
@@ -31,7 +31,7 @@ def registers(**changed: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("value", [0, 1, -1, 65_536, -70_000, 2**31 - 1, -(2**31)])
-def test_a_number_of_two_registers_comes_back(value: int) -> None:
+def test_a_number_of_two_registers_comes_back(value: int):
     number = NumberConfig(address=0)
     assert number.decode(number.encode(value)) == value
     with pytest.raises(ValueError, match="16 bits"):
@@ -41,14 +41,14 @@ def test_a_number_of_two_registers_comes_back(value: int) -> None:
 
 
 @pytest.mark.parametrize("unit", ["rpm/s", "1/6 rps/s", "counts/s^2", "ms to 1000 rpm"])
-def test_a_ramp_in_the_drives_unit_is_never_longer_than_reckoned(unit: str) -> None:
+def test_a_ramp_in_the_drives_unit_is_never_longer_than_reckoned(unit: str):
     """v²/2a has to hold: the acceleration is rounded up, the time that stands for it down."""
     rate = AccelerationConfig(address=0, unit=unit)  # type: ignore[arg-type]
     for turns in (0.7, 3.3, 41.7, 100.0, 777.7):
         assert rate.turns(rate.units(turns, 4096), 4096) >= turns * (1 - 1e-12)
 
 
-def test_actions_and_flags_of_a_map_mean_what_its_manual_says() -> None:
+def test_actions_and_flags_of_a_map_mean_what_its_manual_says():
     made = config(EDGES).registers
     assert made.start.writes == [8, 0]
     assert made.moving.decode(0) and not made.moving.decode(1 << 5)
@@ -66,9 +66,7 @@ def test_actions_and_flags_of_a_map_mean_what_its_manual_says() -> None:
         (({"rail": {key: value for key, value in RAIL.items() if key != "registers"}},), "rail.registers: missing"),
     ],
 )  # fmt: skip
-def test_a_wrong_table_is_refused_with_key_value_and_what_is_allowed(
-    tables: tuple[dict[str, Any], ...], told: str
-) -> None:
+def test_a_wrong_table_is_refused_with_key_value_and_what_is_allowed(tables: tuple[dict[str, Any], ...], told: str):
     with pytest.raises(ConfigError) as met:
         cell(*tables)
     assert told in str(met.value)

@@ -48,7 +48,7 @@ class TestEdges(_OverModbus):
     REGISTERS = EDGES
 
 
-def test_another_client_reads_from_the_drive_what_the_rail_has_written() -> None:
+def test_another_client_reads_from_the_drive_what_the_rail_has_written():
     """pymodbus' own client on the pseudo terminal: the target in two words, the speed in rpm, the place in counts."""
     drive = Drive.of(config(PATHS), pty=True)
     rail = drive.homed(url=drive.peer.pty)
@@ -67,7 +67,7 @@ def test_another_client_reads_from_the_drive_what_the_rail_has_written() -> None
     drive.peer.stop()
 
 
-def test_a_stop_goes_before_whatever_was_not_sent_yet(drive: Drive) -> None:
+def test_a_stop_goes_before_whatever_was_not_sent_yet(drive: Drive):
     rail = drive.homed()
     motion = rail.move_to(0.09, 0.02)
     threads = [threading.Thread(target=rail.stop) for _ in range(3)]
@@ -83,7 +83,7 @@ def test_a_stop_goes_before_whatever_was_not_sent_yet(drive: Drive) -> None:
     rail.close()
 
 
-def test_a_search_ends_as_its_stop_did(drive: Drive) -> None:
+def test_a_search_ends_as_its_stop_did(drive: Drive):
     rail = drive.rail()
     motion = rail.home()
     rail.stop()
@@ -92,7 +92,7 @@ def test_a_search_ends_as_its_stop_did(drive: Drive) -> None:
     rail.close()
 
 
-def test_what_the_drives_units_cannot_say_is_refused_before_anything_is_sent(drive: Drive) -> None:
+def test_what_the_drives_units_cannot_say_is_refused_before_anything_is_sent(drive: Drive):
     rail = drive.homed()
     with pytest.raises(LimitError, match="in the drive's unit"):
         rail.move_to(0.01, 50e-6)
@@ -101,7 +101,7 @@ def test_what_the_drives_units_cannot_say_is_refused_before_anything_is_sent(dri
         drive.rail(acceleration=20.0)
 
 
-def test_who_only_looks_writes_nothing(drive: Drive) -> None:
+def test_who_only_looks_writes_nothing(drive: Drive):
     drive.homed().close()
     before = dict(drive.peer.drive._written)
     rail = drive.rail(control=False)
@@ -125,7 +125,7 @@ print("moves", flush=True)
 motion.wait(600)"""
 
 
-def test_the_rail_stands_when_its_owner_is_killed() -> None:
+def test_the_rail_stands_when_its_owner_is_killed():
     drive = Drive.of(config(PATHS), pty=True)
     record = drive.record.model_copy(update={"url": str(drive.peer.pty)})
     command = [sys.executable, "-c", OWNER, record.model_dump_json()]

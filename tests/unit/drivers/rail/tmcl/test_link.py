@@ -25,15 +25,13 @@ VALUE = st.integers(-(2**31), 2**31 - 1)
 @given(BYTE, BYTE, BYTE, BYTE, VALUE)
 def test_requests_are_byte_for_byte_those_of_the_vendors_library(
     address: int, command: int, kind: int, motor: int, value: int
-) -> None:
+):
     ours = TmclRequest(address, command, kind, motor, value).encode()
     assert ours == bytes(TMCLRequest(address, command, kind, motor, value).to_buffer())
 
 
 @given(BYTE, BYTE, BYTE, BYTE, VALUE)
-def test_replies_of_the_vendors_library_are_understood(
-    host: int, module: int, status: int, command: int, value: int
-) -> None:
+def test_replies_of_the_vendors_library_are_understood(host: int, module: int, status: int, command: int, value: int):
     data = bytes(TMCLReply(host, module, status, command, value).to_buffer())
     reply = decode_reply(data, TmclRequest(module, command, 0, 0))
     found = (reply.host, reply.module, reply.status, reply.command, reply.value)
@@ -41,7 +39,7 @@ def test_replies_of_the_vendors_library_are_understood(
 
 
 @given(st.integers(0, 8), st.integers(1, 255))
-def test_any_changed_byte_is_noticed(index: int, change: int) -> None:
+def test_any_changed_byte_is_noticed(index: int, change: int):
     data = bytearray(TMCLReply(2, 1, 100, 6, 123456).to_buffer())
     data[index] ^= change
     with pytest.raises(TelegramError, match="checksum"):
@@ -49,12 +47,12 @@ def test_any_changed_byte_is_noticed(index: int, change: int) -> None:
 
 
 @pytest.mark.parametrize("length", [0, 8, 10])
-def test_a_reply_has_nine_bytes(length: int) -> None:
+def test_a_reply_has_nine_bytes(length: int):
     with pytest.raises(TelegramError, match=f"{length} bytes"):
         decode_reply(bytes(length), TmclRequest(1, 6, 1, 0))
 
 
-def test_the_answer_of_another_module_or_to_another_command_is_refused() -> None:
+def test_the_answer_of_another_module_or_to_another_command_is_refused():
     data = bytes(TMCLReply(2, 3, 100, 6, 0).to_buffer())
     with pytest.raises(TelegramError, match="module 3 instead of 1"):
         decode_reply(data, TmclRequest(1, 6, 1, 0))
@@ -62,19 +60,19 @@ def test_the_answer_of_another_module_or_to_another_command_is_refused() -> None
         decode_reply(data, TmclRequest(3, 5, 1, 0))
 
 
-def test_the_firmware_text_is_eight_characters_after_the_hosts_address() -> None:
+def test_the_firmware_text_is_eight_characters_after_the_hosts_address():
     assert decode_firmware(b"\x021260V112") == "1260V112"
     with pytest.raises(TelegramError):
         decode_firmware(b"\x021260V1\x00\xff")
 
 
-def test_a_value_beyond_32_bits_is_refused() -> None:
+def test_a_value_beyond_32_bits_is_refused():
     with pytest.raises(ValueError, match="does not fit"):
         TmclRequest(1, 4, 0, 0, 2**31).encode()
 
 
 @pytest.mark.wire
-def test_a_lost_reply_is_asked_for_once_more_and_counted(homed: Bench) -> None:
+def test_a_lost_reply_is_asked_for_once_more_and_counted(homed: Bench):
     homed.peer.fault("rail.drop_reply")
     homed.rail.move_to(0.03).wait(20.0)
     assert (homed.carriage(), homed.rail.statistics.errors["retries"]) == (pytest.approx(0.03, abs=1e-6), 1)
@@ -82,7 +80,7 @@ def test_a_lost_reply_is_asked_for_once_more_and_counted(homed: Bench) -> None:
 
 
 @pytest.mark.wire
-def test_a_peer_that_dies_in_mid_move_is_a_fault_at_once(homed: Bench) -> None:
+def test_a_peer_that_dies_in_mid_move_is_a_fault_at_once(homed: Bench):
     motion = homed.rail.move_to(0.09, speed=0.005)
     homed.peer.stop()
     with pytest.raises(DeviceFault) as caught:
@@ -95,19 +93,19 @@ def test_a_peer_that_dies_in_mid_move_is_a_fault_at_once(homed: Bench) -> None:
         homed.rail.state()
 
 
-def test_a_port_that_is_not_there_is_named() -> None:
+def test_a_port_that_is_not_there_is_named():
     with pytest.raises(NotConnectedError, match="/dev/no-such-port"):
         connect("/dev/no-such-port", Clock())
 
 
 @pytest.mark.wire
-def test_a_silent_module_is_a_deadline(bench: Bench) -> None:
+def test_a_silent_module_is_a_deadline(bench: Bench):
     with pytest.raises(DeadlineError, match=r"module address 9 \(rail\.address\), rail\.baud \(9600"):
         connect(bench.peer.url, bench.clock, address=9)
 
 
 @pytest.mark.wire
-def test_a_left_over_answer_is_never_taken_for_the_next_ones(module: Callable[..., str]) -> None:
+def test_a_left_over_answer_is_never_taken_for_the_next_ones(module: Callable[..., str]):
     # To every request this module sends its answer and, unasked, an older position of 51.2 mm behind it.
     def answer(request: bytes) -> bytes:
         return reply(request, 0) + reply(bytes([1, 6, 1, 0]), 1_310_720)
@@ -120,7 +118,7 @@ def test_a_left_over_answer_is_never_taken_for_the_next_ones(module: Callable[..
 
 @pytest.mark.wire
 @pytest.mark.parametrize("late", [0.2, 0.6, 0.9])
-def test_late_answers_never_become_those_to_later_questions(late: float) -> None:
+def test_late_answers_never_become_those_to_later_questions(late: float):
     """Two replies are late, those behind them come at once after them: a position is that of its time, or an error."""
     listener, asked, ready = socket.create_server(("127.0.0.1", 0)), itertools.count(), threading.Event()
 
@@ -157,7 +155,7 @@ def test_late_answers_never_become_those_to_later_questions(late: float) -> None
 
 
 @pytest.mark.wire
-def test_answers_to_another_command_are_refused_twice_then_reported(module: Callable[..., str]) -> None:
+def test_answers_to_another_command_are_refused_twice_then_reported(module: Callable[..., str]):
     def answer(request: bytes) -> bytes:
         return reply(request) if request[1] != 6 else reply(bytes([1, 5]), 7)
 
@@ -179,7 +177,7 @@ def test_answers_to_another_command_are_refused_twice_then_reported(module: Call
     ],
     ids=["half", "a bit", "another module's before it", "the request had a wrong sum"],
 )
-def test_a_spoilt_reply_is_asked_for_once_more(module: Callable[..., str], spoilt: Callable[[bytes], bytes]) -> None:
+def test_a_spoilt_reply_is_asked_for_once_more(module: Callable[..., str], spoilt: Callable[[bytes], bytes]):
     positions = itertools.count()
 
     def answer(request: bytes) -> bytes:
@@ -192,7 +190,7 @@ def test_a_spoilt_reply_is_asked_for_once_more(module: Callable[..., str], spoil
 
 
 @pytest.mark.wire
-def test_an_adapter_that_hears_itself_is_understood(module: Callable[..., str]) -> None:
+def test_an_adapter_that_hears_itself_is_understood(module: Callable[..., str]):
     rail = connect(module(lambda request: request + reply(request, 1), {}), Clock())
     assert rail.state().position == pytest.approx(0.002 / 51_200)
     assert list(rail.statistics.errors) == ["echoes"]
@@ -200,7 +198,7 @@ def test_an_adapter_that_hears_itself_is_understood(module: Callable[..., str]) 
 
 
 @pytest.mark.wire
-def test_an_adapter_that_hears_itself_alone_is_named(module: Callable[..., str]) -> None:
+def test_an_adapter_that_hears_itself_alone_is_named(module: Callable[..., str]):
     with pytest.raises(DeadlineError, match="0 of 9 bytes came after the adapter's echo"):
         connect(module(lambda request: request, {}), Clock())
 
@@ -209,7 +207,7 @@ def test_an_adapter_that_hears_itself_alone_is_named(module: Callable[..., str])
 @pytest.mark.parametrize("answers", ["refuses", "nothing"])
 def test_the_motor_is_told_to_stop_whatever_becomes_of_the_search_and_of_the_replies(
     module: Callable[..., str], answers: str
-) -> None:
+):
     """A search that cannot be ended, and a module that cannot be heard, which may hear."""
     heard: list[int] = []
 
@@ -229,7 +227,7 @@ def test_the_motor_is_told_to_stop_whatever_becomes_of_the_search_and_of_the_rep
 
 
 @pytest.mark.wire
-def test_a_refusal_of_the_module_is_a_fault_in_words(module: Callable[..., str]) -> None:
+def test_a_refusal_of_the_module_is_a_fault_in_words(module: Callable[..., str]):
     with pytest.raises(DeviceFault, match="invalid value") as caught:
         connect(module(lambda request: reply(request, status=4)), Clock())
     assert caught.value.code == "tmcl.refused"

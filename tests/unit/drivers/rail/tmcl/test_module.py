@@ -27,7 +27,7 @@ def require_not_homed(bench: Bench) -> None:
 )
 def test_a_limit_switch_or_a_stall_on_the_way_is_a_fault_that_names_it_and_loses_the_zero(
     bench: Bench, obstacle: float | None, told: str, code: str
-) -> None:
+):
     if obstacle is not None:
         bench.model.params = replace(bench.model.params, ends=(-0.004, obstacle))
     rail = connect(bench.peer.url, bench.clock, travel=(0.0, 0.12))
@@ -45,7 +45,7 @@ def test_a_limit_switch_or_a_stall_on_the_way_is_a_fault_that_names_it_and_loses
     require_not_homed(bench)
 
 
-def test_the_next_program_finds_the_rail_homed_and_its_zero_where_it_was(homed: Bench) -> None:
+def test_the_next_program_finds_the_rail_homed_and_its_zero_where_it_was(homed: Bench):
     homed.rail.move_to(0.005).wait(10.0)
     homed.rail.close()
     again = connect(homed.peer.url, homed.clock)
@@ -56,7 +56,7 @@ def test_the_next_program_finds_the_rail_homed_and_its_zero_where_it_was(homed: 
     again.close()
 
 
-def test_the_zero_of_another_configuration_is_not_taken_nor_given_back(homed: Bench) -> None:
+def test_the_zero_of_another_configuration_is_not_taken_nor_given_back(homed: Bench):
     homed.rail.close()
     other = connect(homed.peer.url, homed.clock, lead=0.004)
     assert not other.state().homed
@@ -67,7 +67,7 @@ def test_the_zero_of_another_configuration_is_not_taken_nor_given_back(homed: Be
     require_not_homed(homed)
 
 
-def test_a_stall_that_nobody_watched_ends_the_trust_in_the_zero(homed: Bench) -> None:
+def test_a_stall_that_nobody_watched_ends_the_trust_in_the_zero(homed: Bench):
     homed.rail.close()
     homed.peer.module.handle(telegram(5, 13, 1))  # without its left limit switch
     homed.model.rotate(homed.world.now(), -5 * 51_200)
@@ -77,7 +77,7 @@ def test_a_stall_that_nobody_watched_ends_the_trust_in_the_zero(homed: Bench) ->
     require_not_homed(homed)
 
 
-def test_a_rail_that_somebody_left_at_a_limit_switch_is_not_homed_any_more(bench: Bench) -> None:
+def test_a_rail_that_somebody_left_at_a_limit_switch_is_not_homed_any_more(bench: Bench):
     rail = connect(bench.peer.url, bench.clock, travel=(0.0, 0.12))
     rail.home().wait(20.0)
     rail.close()
@@ -90,7 +90,7 @@ def test_a_rail_that_somebody_left_at_a_limit_switch_is_not_homed_any_more(bench
 
 
 @pytest.mark.parametrize("ask", [lambda rail: rail.move_to(0.01), lambda rail: rail.state()], ids=["move", "state"])
-def test_a_reset_is_told_to_who_asks_next_and_the_rail_is_not_homed(homed: Bench, ask: Callable[[Rail], None]) -> None:
+def test_a_reset_is_told_to_who_asks_next_and_the_rail_is_not_homed(homed: Bench, ask: Callable[[Rail], None]):
     homed.rail.move_to(0.03).wait(10.0)
     homed.peer.fault("rail.reset")
     with pytest.raises(DeviceFault, match="lost its zero") as caught:
@@ -102,7 +102,7 @@ def test_a_reset_is_told_to_who_asks_next_and_the_rail_is_not_homed(homed: Bench
     assert homed.carriage() == pytest.approx(0.03, abs=1e-6)
 
 
-def test_a_reset_on_the_way_to_0_is_never_an_arrival(homed: Bench) -> None:
+def test_a_reset_on_the_way_to_0_is_never_an_arrival(homed: Bench):
     homed.rail.move_to(0.03).wait(10.0)
     motion = homed.rail.move_to(0.0, speed=0.01)
     homed.clock.sleep(1.0)
@@ -113,7 +113,7 @@ def test_a_reset_on_the_way_to_0_is_never_an_arrival(homed: Bench) -> None:
     assert caught.value.recoverable
 
 
-def test_a_reset_in_the_search_does_not_end_it_well(bench: Bench) -> None:
+def test_a_reset_in_the_search_does_not_end_it_well(bench: Bench):
     motion = bench.rail.home()
     bench.clock.sleep(0.2)
     bench.peer.fault("rail.reset")
@@ -123,7 +123,7 @@ def test_a_reset_in_the_search_does_not_end_it_well(bench: Bench) -> None:
     assert not bench.rail.state().homed
 
 
-def test_homing_after_a_reset_sets_the_module_up_again(homed: Bench) -> None:
+def test_homing_after_a_reset_sets_the_module_up_again(homed: Bench):
     homed.peer.fault("rail.reset")
     homed.rail.home().wait(20.0)
     homed.rail.move_to(0.02).wait(10.0)
@@ -131,7 +131,7 @@ def test_homing_after_a_reset_sets_the_module_up_again(homed: Bench) -> None:
     assert homed.model.settings.max_acceleration == round(ACCELERATION * 200 * 256 / 0.002)
 
 
-def test_a_target_changed_by_another_is_not_reported_as_arrival(homed: Bench) -> None:
+def test_a_target_changed_by_another_is_not_reported_as_arrival(homed: Bench):
     motion = homed.rail.move_to(0.05, speed=0.02)
     homed.model.move_to(homed.world.now(), 1000)
     with pytest.raises(DeviceFault, match="changed the module's target"):
@@ -141,7 +141,7 @@ def test_a_target_changed_by_another_is_not_reported_as_arrival(homed: Bench) ->
 @pytest.mark.parametrize("refused", [(), (15,), (16,)])
 def test_the_ramp_is_a_trapezium_also_where_its_first_acceleration_may_not_be_zero(
     module: Callable[..., str], refused: tuple[int, ...]
-) -> None:
+):
     """Of 15, 16 and 19 one is the first acceleration, two are speeds, and modules differ in which."""
     settings = {255: 0}  # speeds in units of its own
 
@@ -159,7 +159,7 @@ def test_the_ramp_is_a_trapezium_also_where_its_first_acceleration_may_not_be_ze
 @pytest.mark.parametrize("parameter", [5, 17, 140, 193])
 def test_a_setting_that_the_module_does_not_take_is_a_fault_with_both_values(
     module: Callable[..., str], parameter: int
-) -> None:
+):
     with pytest.raises(DeviceFault, match=rf"keeps 3 for axis parameter {parameter} instead of \d+") as met:
         connect(module(reply, {255: 1, parameter: 3}, (parameter,)), Clock())
     assert met.value.code == "rail.setting"
@@ -168,16 +168,14 @@ def test_a_setting_that_the_module_does_not_take_is_a_fault_with_both_values(
 @pytest.mark.parametrize("model", [b"1110V109", b"1140V145", b"0012V102", b"hello   "])
 def test_a_module_that_counts_in_other_units_or_is_none_is_refused_before_anything_is_set(
     module: Callable[..., str], model: bytes
-) -> None:
+):
     settings: dict[int, int] = {}
     with pytest.raises(ConfigError, match=r"TMCM-1260.*nothing was set"):
         connect(module(lambda request: b"\x02" + model, settings), Clock())
     assert settings == {}
 
 
-def test_a_module_that_lets_neither_first_phase_be_off_gets_no_acceleration_for_a_speed(
-    module: Callable[..., str],
-) -> None:
+def test_a_module_that_lets_neither_first_phase_be_off_gets_no_acceleration_for_a_speed(module: Callable[..., str]):
     """Of parameters 15 and 16 one is a speed, and modules differ in which."""
     told: list[int] = []
 
@@ -192,7 +190,7 @@ def test_a_module_that_lets_neither_first_phase_be_off_gets_no_acceleration_for_
     assert told == [15, 15, 16]
 
 
-def test_a_zero_that_was_lost_is_not_trusted_though_the_module_cannot_be_told(module: Callable[..., str]) -> None:
+def test_a_zero_that_was_lost_is_not_trusted_though_the_module_cannot_be_told(module: Callable[..., str]):
     variables: dict[int, int] = {}
     full = False
 
@@ -216,7 +214,7 @@ def test_a_zero_that_was_lost_is_not_trusted_though_the_module_cannot_be_told(mo
     rail.close()
 
 
-def test_a_module_set_to_other_microsteps_is_not_homed_any_more_and_who_only_looks_leaves_it_so(homed: Bench) -> None:
+def test_a_module_set_to_other_microsteps_is_not_homed_any_more_and_who_only_looks_leaves_it_so(homed: Bench):
     homed.rail.close()
     homed.peer.module.handle(telegram(5, 140, 7))
     looking = connect(homed.peer.url, homed.clock, control=False)
@@ -227,9 +225,7 @@ def test_a_module_set_to_other_microsteps_is_not_homed_any_more_and_who_only_loo
 
 
 @pytest.mark.parametrize("off", [1, -1, 2])
-def test_a_module_that_stands_one_count_off_its_target_has_arrived(
-    homed: Bench, monkeypatch: pytest.MonkeyPatch, off: int
-) -> None:
+def test_a_module_that_stands_one_count_off_its_target_has_arrived(homed: Bench, monkeypatch, off: int):
     counted = homed.model.position
     monkeypatch.setattr(homed.model, "position", lambda t: counted(t) + off)
     motion = homed.rail.move_to(0.01)

@@ -12,12 +12,12 @@ pytestmark = pytest.mark.wire
 
 
 @pytest.mark.parametrize("wrong", [{"travel": (0.1, 0.0)}, {"acceleration": -1.0}])
-def test_impossible_parameters_are_refused_before_the_port_is_opened(wrong: dict[str, Any]) -> None:
+def test_impossible_parameters_are_refused_before_the_port_is_opened(wrong: dict[str, Any]):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         connect("socket://127.0.0.1:1", Clock(), **wrong)
 
 
-def test_who_only_looks_sets_nothing_and_stops_nothing(homed: Bench) -> None:
+def test_who_only_looks_sets_nothing_and_stops_nothing(homed: Bench):
     homed.rail.close()
     homed.peer.module.handle(telegram(4, 0, round(0.09 / 0.002 * 200 * 256)))
     before = homed.model.settings

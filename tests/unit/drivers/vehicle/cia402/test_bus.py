@@ -10,7 +10,7 @@ from tests.support.canopen_bench import RATE, Bench, fault_of, frame
 pytestmark = pytest.mark.wire
 
 
-def test_an_emergency_is_told_in_words_with_its_remedy(bench: Bench) -> None:
+def test_an_emergency_is_told_in_words_with_its_remedy(bench: Bench):
     bench.drive_until_fast()
     bench.peer.drives[1].fault(0x4310)
     fault = fault_of(bench)
@@ -23,7 +23,7 @@ def test_an_emergency_is_told_in_words_with_its_remedy(bench: Bench) -> None:
     assert bench.vehicle.state().trouble == ()
 
 
-def test_the_drives_of_a_second_vehicle_under_the_same_numbers_are_named_and_no_stop_is_believed(apart: Bench) -> None:
+def test_the_drives_of_a_second_vehicle_under_the_same_numbers_are_named_and_no_stop_is_believed(apart: Bench):
     """Their counts are 12,000 apart, and they say that they stand."""
     vehicle = apart.connect()
     vehicle.enable()
@@ -44,7 +44,7 @@ def test_the_drives_of_a_second_vehicle_under_the_same_numbers_are_named_and_no_
     vehicle.close()
 
 
-def test_nobody_there_is_named(apart: Bench) -> None:
+def test_nobody_there_is_named(apart: Bench):
     for drive in apart.peer.drives:
         drive.node.silent = True
     with apart.other() as other:

@@ -19,12 +19,12 @@ from drivers.vehicle.cia402.drive import DriveState, leads_to_enabled, leads_to_
         (0x0200, DriveState.NOT_READY, False),
     ],
 )
-def test_a_statusword_tells_the_state(statusword: int, state: DriveState, turns: bool) -> None:
+def test_a_statusword_tells_the_state(statusword: int, state: DriveState, turns: bool):
     assert state_of(statusword) is state
     assert may_turn(state) is turns
 
 
-def test_the_way_through_the_states() -> None:
+def test_the_way_through_the_states():
     assert leads_to_enabled(DriveState.FAULT, 0x0F) == 0x00
     assert leads_to_enabled(DriveState.FAULT, 0x00) == 0x80  # a rising edge, seen apart
     assert [leads_to_enabled(s, 0) for s in (DriveState.DISABLED, DriveState.READY, DriveState.SWITCHED_ON)] == [
@@ -35,7 +35,7 @@ def test_the_way_through_the_states() -> None:
     assert leads_to_switched_on(DriveState.ENABLED, 15) == 0x07
 
 
-def test_an_emergency_has_words_and_a_remedy_and_an_unknown_one_its_range() -> None:
+def test_an_emergency_has_words_and_a_remedy_and_an_unknown_one_its_range():
     assert meaning(0x8130) == (
         "our heartbeat stayed away, 8130h: see what keeps this computer busy, or raise vehicle.watchdog"
     )

@@ -15,7 +15,7 @@ from tests.support.inner_bus import Hand
 WHEELS = WheelDrives((1, 2), 0.1, 20.0, 4096, "0.1 rpm", (False, True), 0.58, 0.5, 1.0)
 
 
-def test_metres_a_second_become_numbers_of_the_drives() -> None:
+def test_metres_a_second_become_numbers_of_the_drives():
     """0.3 m/s on a wheel of 100 mm is 28.65 turns a minute, behind a gear of 20 572.96."""
     assert WHEELS.targets(0.3, 0.0) == (5730, -5730)
     assert WHEELS.targets(0.0, 1.0) == (-5539, -5539)  # 0.29 m/s of the rims, against each other
@@ -23,7 +23,7 @@ def test_metres_a_second_become_numbers_of_the_drives() -> None:
     assert (WHEELS.count_length, WHEELS.ramp(1.0)) == (pytest.approx(2 * math.pi * 0.1 / 81920), 19099)
 
 
-def test_readings_of_two_different_moments_are_not_one_pose() -> None:
+def test_readings_of_two_different_moments_are_not_one_pose():
     """One drive's reading is lost: each later pair is of one SYNC again, not left of one and right of the next."""
     clock = Hand()
     feedback = DriveFeedback("vehicle", clock, WHEELS, max_speed=0.5, max_yaw_rate=0.8, statistics=LinkStatistics())
@@ -74,7 +74,7 @@ class Told:
 
 @pytest.mark.parametrize("node", [1, 2])
 @pytest.mark.parametrize("velocity", [300, -300])
-def test_one_wheel_that_turns_either_way_is_no_standstill(node: int, velocity: int) -> None:
+def test_one_wheel_that_turns_either_way_is_no_standstill(node: int, velocity: int):
     told = Told()
     for _ in range(AT_REST):
         asked = told.clock.time
@@ -88,7 +88,7 @@ def test_one_wheel_that_turns_either_way_is_no_standstill(node: int, velocity: i
 
 @pytest.mark.parametrize("node", [1, 2])
 @pytest.mark.parametrize("way", [1, -1])
-def test_counts_that_go_on_deny_a_speed_of_zero(node: int, way: int) -> None:
+def test_counts_that_go_on_deny_a_speed_of_zero(node: int, way: int):
     told = Told()
     asked, step = told.clock.time, round(1.2 * CREPT_M / WHEELS.count_length)
     for k in range(1, 3 * AT_REST):
@@ -103,7 +103,7 @@ def test_counts_that_go_on_deny_a_speed_of_zero(node: int, way: int) -> None:
 
 
 @pytest.mark.parametrize("node", [1, 2])
-def test_one_drive_that_falls_silent_is_noticed_though_the_other_tells_on(node: int) -> None:
+def test_one_drive_that_falls_silent_is_noticed_though_the_other_tells_on(node: int):
     told = Told()
     side = told.feedback.drives[node - 1].side
     last = told.feedback.drives[node - 1].moved
@@ -118,7 +118,7 @@ def test_one_drive_that_falls_silent_is_noticed_though_the_other_tells_on(node: 
 
 @pytest.mark.parametrize("node", [1, 2])
 @pytest.mark.parametrize("active", [True, False])
-def test_either_drives_input_tells_of_the_emergency_stop(node: int, active: bool) -> None:
+def test_either_drives_input_tells_of_the_emergency_stop(node: int, active: bool):
     told = Told(replace(WHEELS, stop_input=3, stop_active=active))
     free, pressed = (0, 1 << 3) if active else (1 << 3, 0)
     for each in (1, 2):
@@ -141,7 +141,7 @@ def test_either_drives_input_tells_of_the_emergency_stop(node: int, active: bool
         (0x0217, 3, "left operation"),
     ],
 )
-def test_one_drive_that_does_not_obey_ends_driving(node: int, word: int, mode: int, why: str) -> None:
+def test_one_drive_that_does_not_obey_ends_driving(node: int, word: int, mode: int, why: str):
     told = Told()
     assert told.feedback.gave_up() is None and told.feedback.state(1.0, False, True).command_mode
     told.notify(node, word=word, mode=mode)
@@ -151,7 +151,7 @@ def test_one_drive_that_does_not_obey_ends_driving(node: int, word: int, mode: i
     assert not told.feedback.state(1.0, False, True).command_mode
 
 
-def test_a_drive_that_was_restarted_does_not_obey() -> None:
+def test_a_drive_that_was_restarted_does_not_obey():
     told = Told()
     told.feedback.take(2, HEARTBEAT, b"\0")
     told.notify(2)
@@ -161,7 +161,7 @@ def test_a_drive_that_was_restarted_does_not_obey() -> None:
     assert told.feedback.interruptions == 1
 
 
-def test_a_wrong_unit_is_told_and_an_offset_or_a_gap_is_none() -> None:
+def test_a_wrong_unit_is_told_and_an_offset_or_a_gap_is_none():
     clock = Hand()
     step = round(0.3 / WHEELS.count_length * 0.02)
 

@@ -15,7 +15,7 @@ from tests.support import ROOT
 from tests.support.canopen_bench import WHEELS, Bench, frame
 
 
-def test_the_page_prints_a_vehicle_that_is_valid(tmp_path: Path) -> None:
+def test_the_page_prints_a_vehicle_that_is_valid(tmp_path):
     page = (ROOT / "docs" / "how-to" / "canopen.md").read_text(encoding="utf-8")
     printed = page.split("```toml\n")[1].split("```")[0]
     text = default_toml()
@@ -48,7 +48,7 @@ def config(tmp_path: Path, **changed: str) -> CanopenVehicleConfig:
     return record
 
 
-def test_a_configuration_describes_the_drives(tmp_path: Path) -> None:
+def test_a_configuration_describes_the_drives(tmp_path):
     assert config(tmp_path).wheels() == replace(WHEELS, stop_input=None)
     assert config(tmp_path, stop_input="3").wheels().stop_input == 3
     output = config(tmp_path, brake='"output"', brake_bit="17", brake_locks='"high"').wheels()
@@ -68,15 +68,15 @@ def test_a_configuration_describes_the_drives(tmp_path: Path) -> None:
         ({"wheel_radius": "100"}, "mm"),
     ],
 )
-def test_what_cannot_be_is_refused_with_its_range(tmp_path: Path, changed: dict[str, str], told: str) -> None:
+def test_what_cannot_be_is_refused_with_its_range(tmp_path, changed: dict[str, str], told: str):
     with pytest.raises(ConfigError, match=told):
         config(tmp_path, **changed)
 
 
 @pytest.mark.wire
 def test_the_nodes_of_a_bus_are_found_by_one_question_each_and_the_others_only_heard(
-    apart: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    apart: Bench, tmp_path, monkeypatch
+):
     """Neither a network command nor anything for a node that the configuration does not name is sent."""
     monkeypatch.setattr(make, "LISTEN_S", 0.8)
     record = config(tmp_path).model_copy(update={"interface": "virtual", "channel": apart.channel})

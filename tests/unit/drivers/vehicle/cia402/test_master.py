@@ -12,7 +12,7 @@ from tests.support.canopen_bench import Bench, at_bench, fault_of, frame, with_o
 pytestmark = pytest.mark.wire
 
 
-def test_one_wheel_alone_never_drives(bench: Bench) -> None:
+def test_one_wheel_alone_never_drives(bench: Bench):
     """A drive falls silent: the other is stopped long before the first stops by its own watchdog."""
     bench.drive_until_fast()
     bench.peer.fault("can.node_lost")
@@ -28,7 +28,7 @@ def test_one_wheel_alone_never_drives(bench: Bench) -> None:
     assert bench.vehicle.state().braked
 
 
-def test_a_second_master_is_noticed_and_the_vehicle_stands(bench: Bench) -> None:
+def test_a_second_master_is_noticed_and_the_vehicle_stands(bench: Bench):
     with bench.other() as other:
         for identifier, data, words in (
             (0x000, bytes((0x80, 0)), "NMT command 80h to node all"),
@@ -50,7 +50,7 @@ def test_a_second_master_is_noticed_and_the_vehicle_stands(bench: Bench) -> None
             assert bench.vehicle.state().interruptions == interrupted + 1
 
 
-def test_drives_that_another_master_commands_are_left_alone(apart: Bench) -> None:
+def test_drives_that_another_master_commands_are_left_alone(apart: Bench):
     with apart.other() as other:
         other.send(frame(0x7E))  # nobody's: no harm
         sender = other.send_periodic(frame(0x080), 0.05)
@@ -61,7 +61,7 @@ def test_drives_that_another_master_commands_are_left_alone(apart: Bench) -> Non
     assert [message for message in apart.bus.frames if message.arbitration_id not in (0x080, 0x7E)] == []
 
 
-def test_what_is_said_when_this_program_is_killed_stops_both_and_locks_their_brakes() -> None:
+def test_what_is_said_when_this_program_is_killed_stops_both_and_locks_their_brakes():
     """Sooner than the drives' own watchdog would."""
     settings, wheels = with_output_brake(locks=True)
     with at_bench(settings, wheels=wheels) as bench, bench.other() as other:
@@ -77,7 +77,7 @@ def test_what_is_said_when_this_program_is_killed_stops_both_and_locks_their_bra
         bench.vehicle._closed.set()
 
 
-def test_drives_that_ignore_a_halt_are_stopped_with_the_quick_stop(bench: Bench) -> None:
+def test_drives_that_ignore_a_halt_are_stopped_with_the_quick_stop(bench: Bench):
     bench.drive_until_fast()
     before = bench.vehicle.statistics.errors.get("quick_stop", 0)
     for drive in bench.peer.drives:

@@ -12,7 +12,7 @@ from tests.support.canopen_bench import SETTINGS, WATCHDOG_S, WHEELS, Bench, at_
 pytestmark = pytest.mark.wire
 
 
-def test_a_drive_that_does_not_watch_us_is_refused_before_anything_moves(apart: Bench) -> None:
+def test_a_drive_that_does_not_watch_us_is_refused_before_anything_moves(apart: Bench):
     apart.peer.drives[1].wheel.connection_lost = lambda: None  # type: ignore[method-assign]
     apart.peer.drives[1].node._lost = lambda: None
     vehicle = apart.connect()
@@ -26,7 +26,7 @@ def test_a_drive_that_does_not_watch_us_is_refused_before_anything_moves(apart: 
     assert apart.braked()
 
 
-def test_a_drive_that_somebody_else_turns_is_told_and_left_alone(apart: Bench) -> None:
+def test_a_drive_that_somebody_else_turns_is_told_and_left_alone(apart: Bench):
     values = apart.peer.drives[0].node._values
     values[0x6041, 0].read, values[0x606C, 0].read = lambda: 0x0237, lambda: 3000
     with pytest.raises(DeviceFault, match=r"left drive turns its wheel at 0\.157 m/s") as met:
@@ -36,14 +36,14 @@ def test_a_drive_that_somebody_else_turns_is_told_and_left_alone(apart: Bench) -
     assert {message.data[0] >> 5 for message in apart.bus.frames} <= {2, 3}
 
 
-def test_a_drive_that_counts_otherwise_than_configured_is_refused(apart: Bench) -> None:
+def test_a_drive_that_counts_otherwise_than_configured_is_refused(apart: Bench):
     with pytest.raises(ConfigError, match=r"counts 4096 per turn.*counts_per_turn is 1024"):
         apart.connect(replace(WHEELS, counts=1024))
     with pytest.raises(ConfigError, match=r'measures speed in 0\.1 rpm.*velocity_unit is "rpm"'):
         apart.connect(replace(WHEELS, velocity_unit="rpm"))
 
 
-def test_units_that_contradict_each_other_end_driving() -> None:
+def test_units_that_contradict_each_other_end_driving():
     """A drive that does not say in what it measures: at a tenth of the speed that it counts."""
     made = Bench(replace(SETTINGS, velocity_unit="rpm"))
     for drive in made.peer.drives:
@@ -60,7 +60,7 @@ def test_units_that_contradict_each_other_end_driving() -> None:
 
 
 @pytest.mark.parametrize("locks", [False, True])
-def test_a_brake_on_an_output_follows_it(locks: bool) -> None:
+def test_a_brake_on_an_output_follows_it(locks: bool):
     settings, wheels = with_output_brake(locks)
     with at_bench(settings, wheels=wheels) as bench:
         bench.until(lambda: not bench.braked())
@@ -71,7 +71,7 @@ def test_a_brake_on_an_output_follows_it(locks: bool) -> None:
         assert {drive._outputs >> 17 & 1 for drive in bench.peer.drives} == {locks}
 
 
-def test_a_value_that_is_not_needed_may_be_refused_and_one_that_is_may_not(apart: Bench) -> None:
+def test_a_value_that_is_not_needed_may_be_refused_and_one_that_is_may_not(apart: Bench):
     def refuse(value: int) -> None:
         raise Abort(WRONG_VALUE)
 
@@ -83,7 +83,7 @@ def test_a_value_that_is_not_needed_may_be_refused_and_one_that_is_may_not(apart
     assert met.value.code == "vehicle.setup"
 
 
-def test_drives_of_few_objects_drive_and_what_is_missing_is_named(apart: Bench) -> None:
+def test_drives_of_few_objects_drive_and_what_is_missing_is_named(apart: Bench):
     """No options, no inputs and outputs, no supply voltage; they say neither how they count nor in what unit."""
     for drive in apart.peer.drives:
         for index in (0x605A, 0x605D, 0x605E, 0x6079, 0x608F, 0x60A9, 0x60FD, 0x60FE):
@@ -100,7 +100,7 @@ def test_drives_of_few_objects_drive_and_what_is_missing_is_named(apart: Bench) 
     vehicle.close()
 
 
-def test_a_drive_that_was_switched_off_is_set_up_again_and_its_counts_are_not_trusted(bench: Bench) -> None:
+def test_a_drive_that_was_switched_off_is_set_up_again_and_its_counts_are_not_trusted(bench: Bench):
     bench.drive_until_fast()
     node = bench.peer.drives[0].node
     bench.peer.drives[0].wheel.state = WheelState.DISABLED

@@ -16,7 +16,7 @@ RAMP_WALL_S = 0.3
 """From 0.3 m/s to standstill, and the time to notice, on the wall at three times its pace."""
 
 
-def test_a_drive_that_is_lost_keeps_no_other_brake_open_and_nobody_says_braked() -> None:
+def test_a_drive_that_is_lost_keeps_no_other_brake_open_and_nobody_says_braked():
     settings, wheels = with_output_brake(False)
     with at_bench(settings, wheels=wheels) as bench:
         left, right = bench.peer.drives
@@ -28,7 +28,7 @@ def test_a_drive_that_is_lost_keeps_no_other_brake_open_and_nobody_says_braked()
         left.node.silent = False
 
 
-def test_heartbeats_do_not_pass_for_readings(bench: Bench) -> None:
+def test_heartbeats_do_not_pass_for_readings(bench: Bench):
     bench.vehicle.brake()
     for drive in bench.peer.drives:
         drive.node.state = PRE_OPERATIONAL
@@ -39,7 +39,7 @@ def test_heartbeats_do_not_pass_for_readings(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("guarding", ["heartbeat", "node"])
-def test_the_drives_stop_by_themselves_when_this_program_is_gone(guarding: str) -> None:
+def test_the_drives_stop_by_themselves_when_this_program_is_gone(guarding: str):
     with at_bench(guarding=guarding) as bench:
         bench.drive_until_fast()
         bench.vehicle._master._closed.set()  # its thread ends as with its process
@@ -54,7 +54,7 @@ def test_the_drives_stop_by_themselves_when_this_program_is_gone(guarding: str) 
         bench.vehicle._closed.set()
 
 
-def test_who_only_looks_sets_nothing(apart: Bench) -> None:
+def test_who_only_looks_sets_nothing(apart: Bench):
     vehicle = apart.connect(look=True)
     state = vehicle.state()
     assert (state.battery_volts, state.braked, state.emergency_stop) == (26.4, None, False)

@@ -24,7 +24,7 @@ def ball(count: int = 3000, radius: float = 0.0075) -> np.ndarray:
     )
 
 
-def test_the_sphere_fit_minimises_the_distances_of_noisy_points() -> None:
+def test_the_sphere_fit_minimises_the_distances_of_noisy_points():
     points = ball() + 2e-5 * np.random.default_rng(3).normal(size=(3000, 3))
     fit = campaign.fit_sphere(points)
 
@@ -37,13 +37,13 @@ def test_the_sphere_fit_minimises_the_distances_of_noisy_points() -> None:
             assert squares(fit.centre + sign * step[:3], fit.radius + sign * step[3]) > least
 
 
-def test_three_points_in_a_thousand_are_let_go_and_no_more() -> None:
+def test_three_points_in_a_thousand_are_let_go_and_no_more():
     deviations = np.concatenate([np.linspace(-1e-5, 1e-5, 997), [1e-3, -2e-3, 3e-3]])
     assert campaign.form_all(deviations) == pytest.approx(2e-5)
     assert campaign.form_all(np.concatenate([deviations[3:], [4e-3] * 3])) > 1e-3
 
 
-def test_too_few_points_are_refused() -> None:
+def test_too_few_points_are_refused():
     with pytest.raises(RefusedError, match="50 are needed"):
         campaign.fit_sphere(ball(20))
 
@@ -57,7 +57,7 @@ def exact():
     return spec, head, ScanGeometry(spec.nominal_camera(), plane, head.rail_direction, pin.SE3.Identity())
 
 
-def test_a_head_that_is_known_exactly_measures_the_artefacts_true(exact) -> None:
+def test_a_head_that_is_known_exactly_measures_the_artefacts_true(exact):
     spec, head, geometry = exact
     rng = np.random.default_rng(0)
     ends = campaign.bar_places(spec)[5]
@@ -71,7 +71,7 @@ def test_a_head_that_is_known_exactly_measures_the_artefacts_true(exact) -> None
     assert flat["form_95_mm"] < 0.05
 
 
-def test_a_wrong_scale_of_the_rail_shows_in_the_spacing(exact) -> None:
+def test_a_wrong_scale_of_the_rail_shows_in_the_spacing(exact):
     spec, head, geometry = exact
     wrong = ScanGeometry(
         geometry.camera, geometry.light_plane, 1.002 * geometry.rail_direction, geometry.flange_from_camera
@@ -81,7 +81,7 @@ def test_a_wrong_scale_of_the_rail_shows_in_the_spacing(exact) -> None:
     assert campaign._spacing(clouds, campaign.SPACING)["spacing_mm"] == pytest.approx(0.1, abs=0.01)
 
 
-def test_places_cover_the_volume_as_the_standard_asks() -> None:
+def test_places_cover_the_volume_as_the_standard_asks():
     spec = RigSpec()
     bars = campaign.bar_places(spec)
     counts = len(campaign.ball_places(spec)), len(bars), len(campaign.flat_poses(spec))
@@ -90,5 +90,5 @@ def test_places_cover_the_volume_as_the_standard_asks() -> None:
         assert np.linalg.norm(second - first) == pytest.approx(campaign.SPACING)
 
 
-def test_every_level_has_its_noise() -> None:
+def test_every_level_has_its_noise():
     assert set(campaign.NOISE_FACTOR) == set(LEVELS)

@@ -1,7 +1,5 @@
 """The least time of a motion is that of a straight one at the limits, and what a run's time is made of adds up."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,7 @@ from lab.bench.job.whole_job import JobRecord
 from tests.support.at_station import AtStation
 
 
-def test_a_motion_takes_at_least_what_speed_acceleration_and_jerk_need(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_a_motion_takes_at_least_what_speed_acceleration_and_jerk_need(placed_pot: JobRecord, tmp_path):
     site = AtStation(placed_pot, tmp_path)
     config = load_config(None)
     least = LeastTimes.of(site.cell.devices, config, site.job)
@@ -26,7 +24,7 @@ def test_a_motion_takes_at_least_what_speed_acceleration_and_jerk_need(placed_po
     assert least(Activity("arm", 1.0, 3.0)) == 2.0
 
 
-def test_what_a_run_is_made_of_adds_up(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_what_a_run_is_made_of_adds_up(placed_pot: JobRecord, tmp_path):
     site = AtStation(placed_pot, tmp_path)
     found = activities(placed_pot.folder)
     length = max(one.end for one in found)

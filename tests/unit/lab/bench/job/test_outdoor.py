@@ -3,7 +3,7 @@
 from lab.bench.job.outdoor import configured, scatter, summed_up
 
 
-def test_a_row_counts_what_was_placed_inside_and_refused_for_the_light() -> None:
+def test_a_row_counts_what_was_placed_inside_and_refused_for_the_light():
     placed = {"outcome": "placed", "reason": "", "mean": 0.05, "largest": 0.1, "inside": True, "exposure": 2.0}
     dark = {"outcome": "refused", "reason": "ambient light reaches", "exposure": None}
     other = {"outcome": "refused", "reason": "no board", "exposure": 0.5}
@@ -16,7 +16,7 @@ def test_a_row_counts_what_was_placed_inside_and_refused_for_the_light() -> None
     assert row["wrong"] == 0 and summed_up([placed | {"within_tolerance": False}])["wrong"] == 1
 
 
-def test_the_filter_is_described_and_keeps_the_line_s_centres_in_full_sun() -> None:
+def test_the_filter_is_described_and_keeps_the_line_s_centres_in_full_sun():
     assert configured(True).scan_camera.filter is not None and configured(False).scan_camera.filter is None
     behind, room = scatter(100, True)["px"], scatter(0, True)["px"]
     assert behind is not None and room is not None and room < behind < 0.3

@@ -15,12 +15,12 @@ PLACED = {
 MISPLACED = {"effect": SLIPS, "outcome": "misplaced", "outside": False, "named": True}
 
 
-def test_each_effect_names_a_cause_that_verify_tells() -> None:
+def test_each_effect_names_a_cause_that_verify_tells():
     assert {cause for effect in EFFECTS.values() for cause in effect.causes} == set(LIKELY)
     assert len(EFFECTS) >= 32
 
 
-def test_figures_are_of_the_parts_that_came_to_them() -> None:
+def test_figures_are_of_the_parts_that_came_to_them():
     rows = [PLACED, {**PLACED, "true_mean": 0.05, "true_p95": 0.06, "outside": True, "seen_off_by": 0.03}, MISPLACED]
     assert _placed(rows) == {"parts": 2, "mean": pytest.approx(0.04), "p95": pytest.approx(0.049), "placings": 2.0}
     assert _seen(rows)["mean_mm"] == pytest.approx(0.02) and _seen(rows)["covered_95"] == 1.0
@@ -29,13 +29,13 @@ def test_figures_are_of_the_parts_that_came_to_them() -> None:
     assert (_seen([MISPLACED]), _placed([MISPLACED])) == ({"parts": 0}, {"parts": 0})
 
 
-def test_a_cause_is_named_or_the_part_was_never_put_down() -> None:
+def test_a_cause_is_named_or_the_part_was_never_put_down():
     refused = {**MISPLACED, "outcome": "refused", "named": False}
     unnamed = {**MISPLACED, "named": False}
     assert _named([PLACED]) is None
     assert _named([PLACED, MISPLACED, refused, unnamed]) == pytest.approx(2 / 3)
 
 
-def test_an_effect_that_is_none_is_told_with_those_that_are() -> None:
+def test_an_effect_that_is_none_is_told_with_those_that_are():
     with pytest.raises(ConfigError, match="'a gust': allowed are nothing, held tilted"):
         campaign([1], "nominal", "pot", ["a gust"], "", lambda text: None)

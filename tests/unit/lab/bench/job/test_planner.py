@@ -10,7 +10,7 @@ from cell.motion.planning import Planner
 from lab.bench.job.planner import PEERS, PRODUCT, free_posture, least_distance, planner
 
 
-def test_each_planner_has_a_row_and_every_pair_with_a_way_is_joined(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_planner_has_a_row_and_every_pair_with_a_way_is_joined(monkeypatch):
     monkeypatch.delitem(PEERS, "OMPL BIT*")
     result = planner("pot", 2, 1, 1.0, lambda text: None)
     rows = {row["planner"]: row for row in result["planners"]}
@@ -19,7 +19,7 @@ def test_each_planner_has_a_row_and_every_pair_with_a_way_is_joined(monkeypatch:
     assert rows[PRODUCT]["solved"] == 2 and rows[PRODUCT]["least_distance_mm"] >= 5.0
 
 
-def test_the_least_distance_is_found_between_the_corners() -> None:
+def test_the_least_distance_is_found_between_the_corners():
     arm = ArmKinematics()
     x, y, z = arm.fk(np.zeros(6)).translation
     ball = collision.capsule("ball", collision.FLANGE, (0.0, 0.0, 0.0), (0.0, 0.0, 1e-4), 0.05)
@@ -33,7 +33,7 @@ def test_the_least_distance_is_found_between_the_corners() -> None:
     assert least_distance(joined, way) == pytest.approx(0.13, abs=2e-4)
 
 
-def test_postures_are_drawn_alike_and_are_free() -> None:
+def test_postures_are_drawn_alike_and_are_free():
     arm = ArmKinematics()
     joined = Planner(arm, CollisionModel(arm, collision.arm_bodies()))
     first, again = (free_posture(joined, np.random.default_rng(4)) for _ in range(2))

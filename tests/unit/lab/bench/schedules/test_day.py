@@ -19,7 +19,7 @@ from statemachine.journal import Journal, JournalError, read
 JOBS = [("pot", ("drive_to_target", "place")), ("load", ("pick_nest",))]
 
 
-def test_a_schedule_goes_to_a_line_of_json_and_back() -> None:
+def test_a_schedule_goes_to_a_line_of_json_and_back():
     schedule = Schedule("pot", 3, entries=(Entry("pause", "place", 0.5, 3.0, "part_taken"), Entry("kill")))
     assert Schedule.from_json(schedule.as_json()) == schedule
     assert "\n" not in schedule.as_json()
@@ -29,7 +29,7 @@ def test_a_schedule_goes_to_a_line_of_json_and_back() -> None:
             Schedule.from_json(wrong)
 
 
-def test_the_same_seed_draws_the_same_and_all_acts_come() -> None:
+def test_the_same_seed_draws_the_same_and_all_acts_come():
     drawn = [draw(seed, JOBS, ["nominal", "workshop"], [1, 2]) for seed in range(300)]
     assert drawn[7] == draw(7, JOBS, ["nominal", "workshop"], [1, 2])
     assert {entry.act for schedule in drawn for entry in schedule.entries} == {*FAULTS, *ACTS}
@@ -39,7 +39,7 @@ def test_the_same_seed_draws_the_same_and_all_acts_come() -> None:
     assert ("place", "kill") in {(entry.step, entry.act) for entry in only.entries}
 
 
-def test_what_breaks_a_rule_is_shrunk_to_what_it_takes() -> None:
+def test_what_breaks_a_rule_is_shrunk_to_what_it_takes():
     asked: list[Schedule] = []
 
     def breaks(schedule: Schedule) -> bool:
@@ -59,7 +59,7 @@ def journal(folder: Path) -> Journal:
     return made
 
 
-def test_a_process_that_is_gone_leaves_its_journal_as_it_was_then(tmp_path: Path) -> None:
+def test_a_process_that_is_gone_leaves_its_journal_as_it_was_then(tmp_path):
     writes = journal(tmp_path)
     left = LeftRun.taken(tmp_path, Entry("kill"))
     writes.run_ended("aborted", "later")
@@ -71,7 +71,7 @@ def test_a_process_that_is_gone_leaves_its_journal_as_it_was_then(tmp_path: Path
 
 
 @pytest.mark.parametrize(("amount", "events"), [(0.0, 2), (0.79, 2), (0.8, None), (0.99, None)])
-def test_a_power_cut_tears_the_newest_page_or_the_base(tmp_path: Path, amount: float, events: int | None) -> None:
+def test_a_power_cut_tears_the_newest_page_or_the_base(tmp_path, amount: float, events: int | None):
     writes = journal(tmp_path)
     left = LeftRun.taken(tmp_path, Entry("power_cut", amount=amount))
     writes.close()
@@ -83,7 +83,7 @@ def test_a_power_cut_tears_the_newest_page_or_the_base(tmp_path: Path, amount: f
         assert len(read(tmp_path, whole=True).events) == 3
 
 
-def test_a_full_disk_takes_nothing_until_there_is_room_again(tmp_path: Path) -> None:
+def test_a_full_disk_takes_nothing_until_there_is_room_again(tmp_path):
     with Computer() as computer:
         writes = journal(tmp_path)
         computer.fill_disk()
@@ -96,7 +96,7 @@ def test_a_full_disk_takes_nothing_until_there_is_room_again(tmp_path: Path) -> 
     assert read(tmp_path).events[-1].data == {"text": "again"}
 
 
-def test_the_wall_clock_is_set_and_set_back() -> None:
+def test_the_wall_clock_is_set_and_set_back():
     before = time.time()
     with Computer() as computer:
         computer.step_clock(-3600.0)
@@ -105,20 +105,20 @@ def test_the_wall_clock_is_set_and_set_back() -> None:
     assert time.time() == pytest.approx(before, abs=5.0)
 
 
-def test_each_fault_and_act_that_may_end_a_run_has_its_words() -> None:
+def test_each_fault_and_act_that_may_end_a_run_has_its_words():
     silent = {"pause", "late_word", "kill", "power_cut"}
     assert {*FAULTS, *ACTS} - set(CAUSES) == silent
     assert named("arm: the emergency stop is pressed", ["arm.emergency_stop"], "nominal")
     assert not named("arm: the emergency stop is pressed", ["rail.reset"], "nominal")
 
 
-def test_the_table_counts_what_met_and_tells_what_never_did() -> None:
+def test_the_table_counts_what_met_and_tells_what_never_did():
     record = DayRecord(Schedule("pot", 1), (("placed", ""),), (("place", "pause", "placed"),), ())
     told = summary([record, replace(record, met=(("place", "pause", "refused"),))], JOBS)
     assert told["met"] == [{"step": "place", "act": "pause", "placed": 1, "refused": 1}]
     assert "pause" not in told["never_met"]["place"] and "kill" in told["never_met"]["place"]
 
 
-def test_a_job_of_several_items_is_each_of_them() -> None:
+def test_a_job_of_several_items_is_each_of_them():
     assert [name for name, _ in steps_of(["tray4"])] == ["tray4#1", "tray4#2", "tray4#3", "tray4#4"]
     assert steps_of(["pot"])[0][1][0] == "drive_to_target"

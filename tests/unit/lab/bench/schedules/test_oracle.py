@@ -56,7 +56,7 @@ def end(outcome: str = "faulted", reason: str = "", part: str | None = None, bou
     return RunEnd(outcome, reason, part, tolerance=0.6e-3, bound=bound)
 
 
-def test_a_cell_that_works_as_it_should_breaks_no_rule(cell: VirtualCell, oracle: Oracle) -> None:
+def test_a_cell_that_works_as_it_should_breaks_no_rule(cell: VirtualCell, oracle: Oracle):
     turn(cell)
     drive(cell)
     cell.clock.sleep(0.5)
@@ -75,13 +75,13 @@ def test_a_cell_that_works_as_it_should_breaks_no_rule(cell: VirtualCell, oracle
 @pytest.mark.parametrize(("act", "rule"), [(turn, "arm and vehicle"), (shine, "laser")])
 def test_an_arm_that_moves_or_a_laser_that_shines_while_the_vehicle_drives(
     cell: VirtualCell, oracle: Oracle, act: Callable[[VirtualCell], None], rule: str
-) -> None:
+):
     drive(cell)
     act(cell)
     assert rules(oracle) == {rule}
 
 
-def test_a_laser_that_shines_for_nobody(cell: VirtualCell, oracle: Oracle) -> None:
+def test_a_laser_that_shines_for_nobody(cell: VirtualCell, oracle: Oracle):
     shine(cell)
     cell.clock.sleep(0.5)
     assert rules(oracle) == set()
@@ -89,16 +89,14 @@ def test_a_laser_that_shines_for_nobody(cell: VirtualCell, oracle: Oracle) -> No
     assert rules(oracle) == {"laser"}
 
 
-def test_two_bodies_that_met(cell: VirtualCell, oracle: Oracle) -> None:
+def test_two_bodies_that_met(cell: VirtualCell, oracle: Oracle):
     cell.world.collisions.note(cell.clock.now(), "forearm", "board")
     cell.clock.sleep(0.1)
     assert [str(each) for each in oracle.violations] == ["touch at 0.15 s: forearm met board"]
 
 
 @pytest.mark.parametrize(("held", "force", "broken"), [(True, 40.0, False), (True, 90.0, True), (False, 2.0, True)])
-def test_too_much_force(
-    cell: VirtualCell, oracle: Oracle, monkeypatch: pytest.MonkeyPatch, held: bool, force: float, broken: bool
-) -> None:
+def test_too_much_force(cell: VirtualCell, oracle: Oracle, monkeypatch, held: bool, force: float, broken: bool):
     if not held:
         oracle.did("part_taken")
         cell.world.part.take_away()
@@ -113,7 +111,7 @@ def test_too_much_force(
 )
 def test_something_that_goes_on_after_the_end(
     cell: VirtualCell, oracle: Oracle, what: str, act: Callable[[VirtualCell], None]
-) -> None:
+):
     oracle.stopped()
     cell.clock.sleep(0.6)
     act(cell)
@@ -122,13 +120,13 @@ def test_something_that_goes_on_after_the_end(
     assert what in oracle.violations[0].how
 
 
-def test_a_part_that_is_let_go_in_the_air(cell: VirtualCell, oracle: Oracle) -> None:
+def test_a_part_that_is_let_go_in_the_air(cell: VirtualCell, oracle: Oracle):
     cell.arm.set_digital_output(CLAW, False)
     assert rules(oracle) == {"let go in the air"}
     assert oracle.put_down
 
 
-def test_a_part_that_a_person_takes_is_not_let_go(cell: VirtualCell, oracle: Oracle) -> None:
+def test_a_part_that_a_person_takes_is_not_let_go(cell: VirtualCell, oracle: Oracle):
     oracle.did("part_taken")
     cell.world.part.take_away()
     cell.clock.sleep(0.1)
@@ -136,7 +134,7 @@ def test_a_part_that_a_person_takes_is_not_let_go(cell: VirtualCell, oracle: Ora
     assert not oracle.put_down
 
 
-def test_a_resume_of_what_was_put_down(cell: VirtualCell, oracle: Oracle) -> None:
+def test_a_resume_of_what_was_put_down(cell: VirtualCell, oracle: Oracle):
     oracle.resumed()
     assert rules(oracle) == set()
     cell.arm.set_digital_output(CLAW, False)
@@ -144,7 +142,7 @@ def test_a_resume_of_what_was_put_down(cell: VirtualCell, oracle: Oracle) -> Non
     assert "done twice" in rules(oracle)
 
 
-def test_a_run_with_its_part_in_the_claw_that_is_not_resumed(oracle: Oracle) -> None:
+def test_a_run_with_its_part_in_the_claw_that_is_not_resumed(oracle: Oracle):
     oracle.unresumed("its journal is damaged", torn=True)
     oracle.unresumed("it ended while the claw was releasing or gripping its part", torn=False)
     assert rules(oracle) == set()
@@ -152,7 +150,7 @@ def test_a_run_with_its_part_in_the_claw_that_is_not_resumed(oracle: Oracle) -> 
     assert rules(oracle) == {"forgotten"}
 
 
-def test_a_journal_that_lags_behind_the_claw(cell: VirtualCell, oracle: Oracle) -> None:
+def test_a_journal_that_lags_behind_the_claw(cell: VirtualCell, oracle: Oracle):
     cell.arm.set_digital_output(CLAW, False)
     oracle.violations.clear()
     oracle.stopped()
@@ -165,7 +163,7 @@ def test_a_journal_that_lags_behind_the_claw(cell: VirtualCell, oracle: Oracle) 
     assert rules(oracle) == {"journal"}
 
 
-def test_a_journal_that_tells_otherwise_than_the_world(oracle: Oracle) -> None:
+def test_a_journal_that_tells_otherwise_than_the_world(oracle: Oracle):
     oracle.did("abort")
     for part in (None, "held", "unknown"):
         oracle.ended(end("aborted", "a day's abort", part))
@@ -174,7 +172,7 @@ def test_a_journal_that_tells_otherwise_than_the_world(oracle: Oracle) -> None:
     assert rules(oracle) == {"journal"}
 
 
-def test_an_end_that_names_no_cause_that_was_there(oracle: Oracle) -> None:
+def test_an_end_that_names_no_cause_that_was_there(oracle: Oracle):
     oracle.did("rail.reset")
     oracle.ended(end("faulted", "rail: the module has lost its zero"))
     assert rules(oracle) == set()
@@ -182,7 +180,7 @@ def test_an_end_that_names_no_cause_that_was_there(oracle: Oracle) -> None:
     assert rules(oracle) == {"cause"}
 
 
-def test_a_part_that_is_called_placed_and_is_not(cell: VirtualCell, oracle: Oracle) -> None:
+def test_a_part_that_is_called_placed_and_is_not(cell: VirtualCell, oracle: Oracle):
     oracle.ended(end("placed", part="held"))
     assert rules(oracle) == {"placed"}
 
@@ -192,7 +190,7 @@ def test_a_part_that_is_called_placed_and_is_not(cell: VirtualCell, oracle: Orac
 )
 def test_a_part_that_lies_beside_its_place(
     cell: VirtualCell, oracle: Oracle, off: float, bound: float | None, broken: set[str]
-) -> None:
+):
     oracle.taken = True
     pose = cell.world.scene.world_from_surface.copy()
     pose[:3, 3] += pose[:3, 0] * off
@@ -203,7 +201,7 @@ def test_a_part_that_lies_beside_its_place(
 
 
 @pytest.mark.parametrize("act", ["rail.reset", "surface_moved"])
-def test_what_is_pushed_as_the_part_comes_down_is_nobodys_fault(cell: VirtualCell, oracle: Oracle, act: str) -> None:
+def test_what_is_pushed_as_the_part_comes_down_is_nobodys_fault(cell: VirtualCell, oracle: Oracle, act: str):
     oracle.did(act)
     cell.arm.set_digital_output(CLAW, False)
     oracle.ended(end("placed", part="released"))

@@ -18,7 +18,7 @@ def rows(memory: list[float], handles: list[float]) -> list[dict[str, object]]:
     ]
 
 
-def test_growth_is_that_of_the_jobs_after_the_first_and_one_odd_job_makes_none() -> None:
+def test_growth_is_that_of_the_jobs_after_the_first_and_one_odd_job_makes_none():
     steady = rows([300.0, 380.0, 400.0, 400.2, 460.0, 400.1, 400.3, 400.2], [20.0] * 8)
     assert verdict(growth_of(steady)) == "nothing grows"
     leaking = rows([300.0 + 2.0 * k for k in range(8)], [20.0 + k // 2 for k in range(8)])
@@ -31,7 +31,7 @@ def test_growth_is_that_of_the_jobs_after_the_first_and_one_odd_job_makes_none()
     assert verdict(growth_of(steady[:4])).startswith("none: at least 5 jobs")
 
 
-def test_what_this_program_has_started_is_counted_under_its_name() -> None:
+def test_what_this_program_has_started_is_counted_under_its_name():
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
         assert child.pid in descendants(os.getpid())
         found = counted(os.getpid())
@@ -40,7 +40,7 @@ def test_what_this_program_has_started_is_counted_under_its_name() -> None:
         child.communicate(b"\n")
 
 
-def test_a_pace_is_told_by_its_rate_and_its_gaps() -> None:
+def test_a_pace_is_told_by_its_rate_and_its_gaps():
     times = [0.002 * k for k in range(201)]
     times[100] += 0.001
     pace = pace_of(times)

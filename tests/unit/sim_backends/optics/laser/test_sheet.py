@@ -35,7 +35,7 @@ def test_a_laser_beside_the_camera_s_row_draws_two_peaks_under_a_ledge():
     assert doubled[0] == pytest.approx(240, abs=1)
 
 
-def test_a_bowed_sheet_is_seen_where_geometry_says() -> None:
+def test_a_bowed_sheet_is_seen_where_geometry_says():
     optics = CameraOptics(640, 480, 1667.0, 1667.0, 319.5, 239.5)
     wall = np.eye(4)
     wall[2, 3] = 0.130
@@ -50,7 +50,7 @@ def test_a_bowed_sheet_is_seen_where_geometry_says() -> None:
     assert sag.max() > 0.9e-4
 
 
-def test_oil_darkens_the_stripe_and_draws_its_centre_away_from_the_laser() -> None:
+def test_oil_darkens_the_stripe_and_draws_its_centre_away_from_the_laser():
     puddle, flat = Puddle((0.002, 0.004), 0.007, 0.1e-3), height_field(lambda x, y: 0 * x)
     dry, wet = (MeshInstance(facing([0, 0, 0], 0.130), flat, 0.6, Grain(oil=oil)) for oil in (None, puddle))
     (before, light), (after, left) = centroids(stripe([dry])), centroids(stripe([wet]))

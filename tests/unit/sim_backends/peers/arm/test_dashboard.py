@@ -3,7 +3,6 @@
 import socket
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -13,11 +12,11 @@ from tests.support.simulator.script_controller import Controller
 
 
 @pytest.fixture
-def dashboard(controller: Controller, tmp_path: Path) -> DashboardServer:
+def dashboard(controller: Controller, tmp_path) -> DashboardServer:
     return DashboardServer(controller.model, controller.program, tmp_path)
 
 
-def test_it_answers_as_the_makers_reference_has_it(dashboard: DashboardServer) -> None:
+def test_it_answers_as_the_makers_reference_has_it(dashboard: DashboardServer):
     asked = {
         "get operational mode": "NONE", "set operational mode manual": "Operational mode 'manual' is set",
         "set operational mode AUTOMATIC": "Operational mode 'AUTOMATIC' is set",
@@ -39,7 +38,7 @@ def test_it_answers_as_the_makers_reference_has_it(dashboard: DashboardServer) -
     assert dashboard.answer("get serial number").isdigit()
 
 
-def test_in_local_control_it_refuses_what_changes_something(dashboard: DashboardServer, controller: Controller) -> None:
+def test_in_local_control_it_refuses_what_changes_something(dashboard: DashboardServer, controller: Controller):
     controller.model.fault("local_control")
     refused = "Command is not allowed due to safety reasons, please switch robot to Remote Control mode"
     for command in ("power off", "stop", "play", "load a.urp", "unlock protective stop"):
@@ -47,9 +46,7 @@ def test_in_local_control_it_refuses_what_changes_something(dashboard: Dashboard
     assert (dashboard.answer("is in remote control"), controller.model.power) == ("false", Power.RUNNING)
 
 
-def test_programs_of_a_folder_are_loaded_played_and_named(
-    dashboard: DashboardServer, controller: Controller, tmp_path: Path
-) -> None:
+def test_programs_of_a_folder_are_loaded_played_and_named(dashboard: DashboardServer, controller: Controller, tmp_path):
     (tmp_path / "waiting.script").write_text("def waiting():\n  while True:\n    sync()\n  end\nend\n")
     for command, answer in (
         ("load waiting.urp", "Loading program: waiting.urp"), ("get loaded program", "Loaded program: waiting.urp"),
@@ -64,7 +61,7 @@ def test_programs_of_a_folder_are_loaded_played_and_named(
 
 
 @pytest.mark.wire
-def test_an_arm_can_be_served_on_its_own() -> None:
+def test_an_arm_can_be_served_on_its_own():
     command = [sys.executable, "-m", "sim_backends.peers.arm.rtde.server", "--model", "UR5e"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

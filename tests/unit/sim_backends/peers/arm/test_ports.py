@@ -30,7 +30,7 @@ def told(connection: socket.socket) -> Iterator[bytes]:
 
 
 @pytest.mark.parametrize("port", [30001, 30002, 30011, 30012])
-def test_the_state_has_the_parts_of_a_recorded_one(address: str, port: int) -> None:
+def test_the_state_has_the_parts_of_a_recorded_one(address: str, port: int):
     greeting, state = packages(port, address, 2)
     assert greeting[4] == 20
     assert state[4] == 16
@@ -43,7 +43,7 @@ def test_the_state_has_the_parts_of_a_recorded_one(address: str, port: int) -> N
 
 
 @pytest.mark.parametrize("port", [30003, 30013])
-def test_the_real_time_port_sends_1220_bytes_in_every_cycle(address: str, port: int) -> None:
+def test_the_real_time_port_sends_1220_bytes_in_every_cycle(address: str, port: int):
     found = packages(port, address, 20)
     assert {len(packet) for packet in found} == {1220}
     numbers = [struct.unpack_from(">152d", packet, 4) for packet in found]
@@ -54,7 +54,7 @@ def test_the_real_time_port_sends_1220_bytes_in_every_cycle(address: str, port: 
     assert numbers[0][131] == 1.0, "no program"
 
 
-def test_the_primary_port_tells_of_programs_and_those_for_reading_take_none(address: str) -> None:
+def test_the_primary_port_tells_of_programs_and_those_for_reading_take_none(address: str):
     reading = socket.create_connection((address, 30011), timeout=5.0)
     sending = socket.create_connection((address, 30002), timeout=5.0)
     with reading, sending:
@@ -68,7 +68,7 @@ def test_the_primary_port_tells_of_programs_and_those_for_reading_take_none(addr
     assert b"takes nothing" not in heard
 
 
-def test_a_protective_stop_is_told_with_a_state_that_shows_it_and_this_port_unlocks_at_once(address: str) -> None:
+def test_a_protective_stop_is_told_with_a_state_that_shows_it_and_this_port_unlocks_at_once(address: str):
     """The maker's library sends its next command on the first of these messages, whatever state it has seen last."""
     with socket.create_connection((address, 30001), timeout=5.0) as primary:
         heard = told(primary)
@@ -92,7 +92,7 @@ def test_a_protective_stop_is_told_with_a_state_that_shows_it_and_this_port_unlo
         assert stamp - at < 250_000, "the dashboard of this arm would make us wait 300 ms"
 
 
-def test_a_program_that_does_not_compile_is_told_as_a_controller_tells_it(address: str) -> None:
+def test_a_program_that_does_not_compile_is_told_as_a_controller_tells_it(address: str):
     with socket.create_connection((address, 30001), timeout=5.0) as primary:
         primary.sendall(b"def illegal_fun():\n  calldoesntexist()\nend\n")
         error = next(package for package in told(primary) if package[4] == 20 and package[14] == 10)

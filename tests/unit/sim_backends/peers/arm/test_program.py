@@ -24,7 +24,7 @@ def arrived(controller: Controller) -> bool:
     return bool(np.allclose(controller.model.drive.q, GOAL))
 
 
-def test_a_pause_comes_to_rest_and_a_play_goes_on_to_the_old_target(moving: Controller) -> None:
+def test_a_pause_comes_to_rest_and_a_play_goes_on_to_the_old_target(moving: Controller):
     assert moving.program.pause() and moving.state is RuntimeState.PAUSING
     moving.run_for(0.2)
     assert (moving.state, moving.model.moving) == (RuntimeState.PAUSED, False)
@@ -36,7 +36,7 @@ def test_a_pause_comes_to_rest_and_a_play_goes_on_to_the_old_target(moving: Cont
     assert arrived(moving)
 
 
-def test_a_safeguard_pauses_and_its_closing_resumes(moving: Controller) -> None:
+def test_a_safeguard_pauses_and_its_closing_resumes(moving: Controller):
     moving.model.fault("safeguard_stop")
     moving.run_for(0.3)
     assert (moving.state, moving.model.moving) == (RuntimeState.PAUSED, False)
@@ -47,7 +47,7 @@ def test_a_safeguard_pauses_and_its_closing_resumes(moving: Controller) -> None:
 
 
 @pytest.mark.parametrize("state", ["pausing", "paused", "resuming"])
-def test_a_stop_ends_a_program_in_every_state_for_ever(moving: Controller, state: str) -> None:
+def test_a_stop_ends_a_program_in_every_state_for_ever(moving: Controller, state: str):
     moving.program.pause()
     if state != "pausing":
         moving.run_for(0.3)
@@ -71,7 +71,7 @@ def watched(controller: Controller, frequency: float) -> None:
     assert controller.state is RuntimeState.PLAYING
 
 
-def test_the_watchdog_ends_the_program_after_its_time_and_not_before(controller: Controller) -> None:
+def test_the_watchdog_ends_the_program_after_its_time_and_not_before(controller: Controller):
     watched(controller, 10.0)
     for _ in range(10):
         controller.run_for(0.09)
@@ -82,7 +82,7 @@ def test_the_watchdog_ends_the_program_after_its_time_and_not_before(controller:
     assert controller.state is RuntimeState.STOPPED
 
 
-def test_cycles_that_the_host_held_up_are_no_silence(controller: Controller) -> None:
+def test_cycles_that_the_host_held_up_are_no_silence(controller: Controller):
     watched(controller, 10.0)
     controller.run_for(0.5, held_up=True)
     assert controller.state is RuntimeState.PLAYING
@@ -94,7 +94,7 @@ def secondary(*lines: str) -> str:
     return "sec outputs():\n" + "".join(f"  {line}\n" for line in lines) + "end\n"
 
 
-def test_a_secondary_program_leaves_the_main_one_running(moving: Controller) -> None:
+def test_a_secondary_program_leaves_the_main_one_running(moving: Controller):
     moving.program.load(secondary("set_digital_out(3,True)"))
     assert moving.outputs == 1 << 3
     assert (moving.state, moving.model.moving) == (RuntimeState.PLAYING, True)
@@ -103,7 +103,7 @@ def test_a_secondary_program_leaves_the_main_one_running(moving: Controller) -> 
 
 
 @pytest.mark.parametrize("line", ["movej([0,0,0,0,0,0])", "stopj(2)", "sleep(1)", "launch()"])
-def test_a_secondary_program_that_takes_time_fails_and_the_main_one_outlives_it(moving: Controller, line: str) -> None:
+def test_a_secondary_program_that_takes_time_fails_and_the_main_one_outlives_it(moving: Controller, line: str):
     moving.program.load(secondary(line, "set_digital_out(3,True)"))
     assert "failed" in moving.program.message
     assert moving.outputs == 0
@@ -114,7 +114,7 @@ def test_a_secondary_program_that_takes_time_fails_and_the_main_one_outlives_it(
 @pytest.mark.parametrize(("kind", "number", "bit"), [("standard", 2, 2), ("configurable", 1, 9), ("tool", 1, 17)])
 def test_an_output_that_is_low_when_no_program_runs_cannot_be_raised_then(
     controller: Controller, kind: str, number: int, bit: int
-) -> None:
+):
     controller.program.load(secondary(f"set_runstate_{kind}_digital_output_to_value({number}, 1)"))
     controller.program.load(MOVE)
     both = 1 << bit | 1

@@ -97,7 +97,7 @@ def client(peer: FramePeer) -> Iterator[Client]:
     client.socket.close()
 
 
-def test_a_frame_is_stamped_by_the_devices_clock_a_latency_after_its_exposure_began(clock: WorldClock) -> None:
+def test_a_frame_is_stamped_by_the_devices_clock_a_latency_after_its_exposure_began(clock: WorldClock):
     middles: list[float] = []
 
     def render(t_mid: float, exposure: float) -> NDArray[np.uint8]:
@@ -116,8 +116,8 @@ def test_a_frame_is_stamped_by_the_devices_clock_a_latency_after_its_exposure_be
 
 
 def test_slow_rendering_drops_exposures_beyond_the_backlog_and_says_so(
-    client: Client, shutter: threading.Event, clock: WorldClock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    client: Client, shutter: threading.Event, clock: WorldClock, monkeypatch
+):
     monkeypatch.setattr(frame_peer, "BACKLOG_S", 63.5 / 120.0)
     shutter.clear()
     client.ask(op="start", frame_rate=120.0)
@@ -144,7 +144,7 @@ def test_slow_rendering_drops_exposures_beyond_the_backlog_and_says_so(
         ({"op": None}, ("unknown op",)),
     ],
 )
-def test_bad_requests_are_refused_with_the_reason(client: Client, request_: dict[str, Any], words: tuple[str]) -> None:
+def test_bad_requests_are_refused_with_the_reason(client: Client, request_: dict[str, Any], words: tuple[str]):
     reply = client.ask(**request_)
     assert reply["ok"] is False
     for word in words:
@@ -152,7 +152,7 @@ def test_bad_requests_are_refused_with_the_reason(client: Client, request_: dict
     assert client.ask(op="latch")["ok"]
 
 
-def test_requests_that_clash_with_free_running_are_refused(client: Client) -> None:
+def test_requests_that_clash_with_free_running_are_refused(client: Client):
     client.ask(op="start", frame_rate=20.0)
     for request in ({"op": "start"}, {"op": "trigger"}, {"op": "configure", "exposure_s": 0.001}):
         reply = client.ask(**request)
@@ -160,7 +160,7 @@ def test_requests_that_clash_with_free_running_are_refused(client: Client) -> No
         assert "stop first" in reply["error"]
 
 
-def test_garbage_ends_its_own_connection_only(peer: FramePeer) -> None:
+def test_garbage_ends_its_own_connection_only(peer: FramePeer):
     first = Client(peer.address)
     first.socket.sendall(b"GET / HTTP/1.1\r\n\r\n")
     header, _ = first.receive()

@@ -51,7 +51,7 @@ class Client:
         return int(struct.unpack(">I", self.ask(0x80, struct.pack(">I", address))[1])[0])
 
 
-def test_one_client_controls_it_and_loses_control_when_it_falls_silent(peer: GigePeer) -> None:
+def test_one_client_controls_it_and_loses_control_when_it_falls_silent(peer: GigePeer):
     first, second = Client(peer), Client(peer)
     assert first.write(g.WIDTH, 32) == 0x8006, "nobody controls it yet"
     assert first.write(g.CONTROL, 2) == first.write(g.HEARTBEAT, 500) == first.write(g.WIDTH, 32) == 0
@@ -61,7 +61,7 @@ def test_one_client_controls_it_and_loses_control_when_it_falls_silent(peer: Gig
     assert second.write(g.CONTROL, 2) == 0
 
 
-def test_a_picture_comes_to_where_it_is_told_and_its_packets_again(peer: GigePeer) -> None:
+def test_a_picture_comes_to_where_it_is_told_and_its_packets_again(peer: GigePeer):
     client = Client(peer)
     port = client.socket.getsockname()[1]
     for address, value in ((g.CONTROL, 2), (g.PACKET_SIZE, 576), (g.STREAM_ADDRESS, 0x7F000001), (g.STREAM_PORT, port)):

@@ -16,7 +16,7 @@ def memory() -> g.GigeMemory:
     return g.GigeMemory(SPEC, "127.0.0.1")
 
 
-def test_the_bootstrap_registers_say_what_it_is(memory: g.GigeMemory) -> None:
+def test_the_bootstrap_registers_say_what_it_is(memory: g.GigeMemory):
     assert memory.word(0x0000) == 0x00010002, "version 1.2"
     assert memory.read(0x00D8, 16).rstrip(b"\0") == b"SIM000007-SCAN"
     name, address, size = memory.read(0x0200, 512).rstrip(b"\0").decode().removeprefix("Local:").split(";")
@@ -24,7 +24,7 @@ def test_the_bootstrap_registers_say_what_it_is(memory: g.GigeMemory) -> None:
     assert name.endswith(".xml") and text.startswith(b"<?xml") and b"ExposureTime" in text
 
 
-def test_registers_keep_their_ranges_and_the_payload_follows(memory: g.GigeMemory) -> None:
+def test_registers_keep_their_ranges_and_the_payload_follows(memory: g.GigeMemory):
     for address, value, status in (
         (g.WIDTH, 65, g.GvcpStatus.INVALID_PARAMETER), (g.PIXEL_FORMAT, 7, g.GvcpStatus.INVALID_PARAMETER),
         (g.HEARTBEAT, 10, g.GvcpStatus.INVALID_PARAMETER), (0x0000, 1, g.GvcpStatus.WRITE_PROTECT),
@@ -39,7 +39,7 @@ def test_registers_keep_their_ranges_and_the_payload_follows(memory: g.GigeMemor
     assert memory.word(g.PAYLOAD) == 32 * 48 * 12 // 8
 
 
-def test_pixels_are_packed_as_the_standards_lay_them_out() -> None:
+def test_pixels_are_packed_as_the_standards_lay_them_out():
     image = np.array([[0xAB, 0xCD, 0x12, 0x34]], np.uint8)
     ten = [value << 2 for value in image[0].tolist()]
     expected = {

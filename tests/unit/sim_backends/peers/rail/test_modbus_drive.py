@@ -9,7 +9,7 @@ from sim_backends.peers.rail.modbus_drive import ModbusDriveServer
 from tests.support.modbus_maps import PATHS, RAIL
 
 
-def test_it_positions_once_all_settings_are_as_they_have_to_be_and_a_reset_forgets_the_zero() -> None:
+def test_it_positions_once_all_settings_are_as_they_have_to_be_and_a_reset_forgets_the_zero():
     record = ModbusRailConfig.model_validate({**RAIL, "unit": 7, "registers": PATHS})
     clock, rail = SteppedClock(), RailModel(RailParams(steps_per_turn=10_000), np.random.default_rng(1))
     drive = ModbusDriveServer(rail, clock, record.model_dump(mode="json"))

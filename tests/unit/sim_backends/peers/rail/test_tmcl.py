@@ -59,7 +59,7 @@ def port(peer: TmclPeer) -> Iterator[serial.SerialBase]:
         yield port
 
 
-def test_the_vendors_client_reads_version_and_serial_number(client: SerialTmclInterface, module: TMCM1260) -> None:
+def test_the_vendors_client_reads_version_and_serial_number(client: SerialTmclInterface, module: TMCM1260):
     assert client.get_version_string() == "1260V112"
     assert client.send(136, 1, 0, 0).value == 1260 << 16 | 1 << 8 | 12
     assert module.get_global_parameter(0, 2) == 4711
@@ -68,7 +68,7 @@ def test_the_vendors_client_reads_version_and_serial_number(client: SerialTmclIn
 
 def test_the_vendors_client_homes_and_moves_the_rail(
     client: SerialTmclInterface, module: TMCM1260, model: RailModel, clock: WorldClock
-) -> None:
+):
     axis = module.motors[0]
     axis.set_axis_parameter(axis.AP.ReferenceSearchMode, 5)
     client.reference_search(0, 0)
@@ -86,9 +86,7 @@ def test_the_vendors_client_homes_and_moves_the_rail(
     assert axis.actual_position == 20 * STEPS
 
 
-def test_the_ramp_has_the_names_of_the_vendors_library_and_is_none_until_it_is_set(
-    module: TMCM1260, model: RailModel
-) -> None:
+def test_the_ramp_has_the_names_of_the_vendors_library_and_is_none_until_it_is_set(module: TMCM1260, model: RailModel):
     axis = module.motors[0]
     axis.linear_ramp.max_acceleration = 40 * STEPS
     assert axis.get_axis_parameter(axis.AP.MaxDeceleration) < 40 * STEPS
@@ -99,7 +97,7 @@ def test_the_ramp_has_the_names_of_the_vendors_library_and_is_none_until_it_is_s
     assert ramp_of_module == (1000, 2000, 3000, 4000)
 
 
-def test_parameters_are_kept_and_range_checked(module: TMCM1260, client: SerialTmclInterface) -> None:
+def test_parameters_are_kept_and_range_checked(module: TMCM1260, client: SerialTmclInterface):
     axis = module.motors[0]
     for parameter, value in ((axis.AP.MaxCurrent, 200), (axis.AP.MicrostepResolution, 6), (axis.AP.MaxVelocity, 51200)):
         axis.set_axis_parameter(parameter, value)
@@ -123,7 +121,7 @@ def test_parameters_are_kept_and_range_checked(module: TMCM1260, client: SerialT
         assert refusal.value.status_code == status
 
 
-def test_a_locked_eeprom_refuses_to_store(module: TMCM1260) -> None:
+def test_a_locked_eeprom_refuses_to_store(module: TMCM1260):
     axis = module.motors[0]
     axis.set_axis_parameter(axis.AP.MaxCurrent, 77)
     module.store_axis_parameter(axis.AP.MaxCurrent, 0)
@@ -136,7 +134,7 @@ def test_a_locked_eeprom_refuses_to_store(module: TMCM1260) -> None:
     assert refusal.value.status_code == 5
 
 
-def test_garbage_parts_and_foreign_addresses_do_no_harm(peer: TmclPeer, port: serial.SerialBase) -> None:
+def test_garbage_parts_and_foreign_addresses_do_no_harm(peer: TmclPeer, port: serial.SerialBase):
     port.write(b"\xff" * 5)
     WorldClock().sleep(0.2)
     port.write(request(7, 6, 1))
@@ -146,7 +144,7 @@ def test_garbage_parts_and_foreign_addresses_do_no_harm(peer: TmclPeer, port: se
     assert sum(reply[:8]) % 256 == reply[8]
 
 
-def test_a_reset_takes_what_is_not_in_the_eeprom(peer: TmclPeer, module: TMCM1260, model: RailModel) -> None:
+def test_a_reset_takes_what_is_not_in_the_eeprom(peer: TmclPeer, module: TMCM1260, model: RailModel):
     axis = module.motors[0]
     module.set_global_parameter(7, 2, 70)
     module.store_global_parameter(7, 2)

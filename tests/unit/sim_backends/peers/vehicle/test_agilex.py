@@ -19,7 +19,7 @@ pytestmark = pytest.mark.wire
 DBC = ROOT / "drivers" / "vehicle" / "agilex_v2.dbc"
 
 
-def test_the_vehicle_drives_at_the_commanded_speed(bus: can.BusABC, model: VehicleModel, clock: WorldClock) -> None:
+def test_the_vehicle_drives_at_the_commanded_speed(bus: can.BusABC, model: VehicleModel, clock: WorldClock):
     bus.send(message(0x421, [1, 0, 0, 0, 0, 0, 0, 0]))
     receive(bus, lambda f: f.arbitration_id == 0x211 and f.data[1] == 1)
     end = clock.now() + 1.5
@@ -36,7 +36,7 @@ def test_the_vehicle_drives_at_the_commanded_speed(bus: can.BusABC, model: Vehic
     assert left > 150
 
 
-def test_feedback_means_the_same_in_the_shared_dbc(bus: can.BusABC, model: VehicleModel, clock: WorldClock) -> None:
+def test_feedback_means_the_same_in_the_shared_dbc(bus: can.BusABC, model: VehicleModel, clock: WorldClock):
     database = cantools.database.load_file(DBC)
     model.set_mode(clock.now(), Mode.CAN)
     model.fault("vehicle.motor_fault", clock.now())
@@ -61,7 +61,7 @@ def test_feedback_means_the_same_in_the_shared_dbc(bus: can.BusABC, model: Vehic
 
 
 @pytest.mark.parametrize(("speed", "fast", "slow"), [(1.0, 50, 50), (50.0, 200, 50)])
-def test_feedback_keeps_its_cycles_and_does_not_flood_a_fast_world(speed: float, fast: int, slow: int) -> None:
+def test_feedback_keeps_its_cycles_and_does_not_flood_a_fast_world(speed: float, fast: int, slow: int):
     peer = AgilexPeer(VehicleModel(VehicleParams(), np.random.default_rng(1)), WorldClock(speed))
     peer.start()
     bus = open_bus(peer)

@@ -53,7 +53,7 @@ def bench() -> Iterator[tuple[Bench, canopen.Network, list[BaseNode402]]]:
     made.peer.stop()
 
 
-def test_another_master_maps_pdos_and_takes_the_drives_through_their_states(bench) -> None:
+def test_another_master_maps_pdos_and_takes_the_drives_through_their_states(bench):
     made, network, nodes = bench
     for node in nodes:
         node.nmt.state = "PRE-OPERATIONAL"

@@ -42,7 +42,7 @@ def bus() -> Bus:
     return Bus()
 
 
-def test_values_are_read_written_and_refused_by_their_codes(bus: Bus) -> None:
+def test_values_are_read_written_and_refused_by_their_codes(bus: Bus):
     assert bus.sdo(0x40, 0x6041, 0) == (0x4B, 0x0250)
     assert bus.sdo(0x23, 0x60FF, 0, 1234)[0] == 0x60
     assert bus.sdo(0x40, 0x60FF, 0) == (0x43, 1234)
@@ -53,7 +53,7 @@ def test_values_are_read_written_and_refused_by_their_codes(bus: Bus) -> None:
         assert bus.sdo(*request) == (0x80, code)
 
 
-def test_a_master_whose_heartbeat_stays_away_is_lost_once(bus: Bus) -> None:
+def test_a_master_whose_heartbeat_stays_away_is_lost_once(bus: Bus):
     assert bus.sdo(0x23, 0x1016, 1, 127 << 16 | 200)[0] == 0x60
     bus.hear(0x000, bytes([0x01, 0]))
     bus.node.tick(5.0)

@@ -27,7 +27,7 @@ def ask(adapter: socket.socket, line: bytes) -> bytes:
     return answer
 
 
-def test_all_clients_share_the_bus(peer: AgilexPeer, bus: can.BusABC) -> None:
+def test_all_clients_share_the_bus(peer: AgilexPeer, bus: can.BusABC):
     other = open_bus(peer)
     receive(other, lambda f: True)
     bus.send(message(0x7AB, [1, 2, 3]))
@@ -35,7 +35,7 @@ def test_all_clients_share_the_bus(peer: AgilexPeer, bus: can.BusABC) -> None:
     other.shutdown()
 
 
-def test_an_adapter_answers_as_the_lawicel_protocol_says(adapter: socket.socket, peer: AgilexPeer) -> None:
+def test_an_adapter_answers_as_the_lawicel_protocol_says(adapter: socket.socket, peer: AgilexPeer):
     assert (ask(adapter, b"V"), ask(adapter, b"N"), ask(adapter, b"t1110")) == (b"V1013\r", b"NSIM1\r", b"\a")
     assert (ask(adapter, b"S5"), ask(adapter, b"O"), ask(adapter, b"O")) == (b"\r", b"\r", b"\a")
     assert (ask(adapter, b"t1110"), ask(adapter, b"F"), ask(adapter, b"C")) == (b"\a", b"F84\r", b"\r")

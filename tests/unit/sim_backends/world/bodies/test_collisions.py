@@ -1,7 +1,6 @@
 """Solid things stop each other in the simulated world, and the truth says what met what."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -49,7 +48,7 @@ def outline(world: World) -> np.ndarray:
     return corners @ turn.T + [x, y]
 
 
-def test_a_vehicle_that_drives_into_the_table_stays_before_it_and_reports_an_exception(world: World) -> None:
+def test_a_vehicle_that_drives_into_the_table_stays_before_it_and_reports_an_exception(world: World):
     world.vehicle.set_mode(0.0, Mode.CAN)
     advance(world, 10.0, speed=0.4)
     assert outline(world)[:, 0].max() == pytest.approx(-nominal.TABLE_HALF, abs=0.003)
@@ -63,7 +62,7 @@ def test_a_vehicle_that_drives_into_the_table_stays_before_it_and_reports_an_exc
     assert met[0]["time"] == pytest.approx(2.3 / 0.4 + 0.5 * 0.4 / 0.6, abs=0.05)
 
 
-def test_a_vehicle_may_stand_a_millimetre_before_the_table_and_not_one_in_it(world: World) -> None:
+def test_a_vehicle_may_stand_a_millimetre_before_the_table_and_not_one_in_it(world: World):
     collisions = Collisions(world.scene, world.part)
     edge = -nominal.TABLE_HALF - 0.5
     assert not collisions.blocks(0.0, (edge - 0.001, 0.0, 0.0))
@@ -74,7 +73,7 @@ def test_a_vehicle_may_stand_a_millimetre_before_the_table_and_not_one_in_it(wor
     assert collisions.blocks(0.0, (-nominal.TABLE_HALF - corner + 0.001, 0.0, math.pi / 4))
 
 
-def test_the_arm_that_is_sent_into_the_deck_stops_as_a_real_one_does_and_can_leave_it_unlocked(world: World) -> None:
+def test_the_arm_that_is_sent_into_the_deck_stops_as_a_real_one_does_and_can_leave_it_unlocked(world: World):
     world.arm.start(JointMove(OVER_DECK, 1.0, 2.0))
     advance(world, 8.0)
     assert world.arm.safety is Safety.NORMAL
@@ -99,7 +98,7 @@ def test_the_arm_that_is_sent_into_the_deck_stops_as_a_real_one_does_and_can_lea
     assert len(world.collisions.found) == count
 
 
-def test_obstacles_of_configuration_and_job_are_solid(tmp_path: Path) -> None:
+def test_obstacles_of_configuration_and_job_are_solid(tmp_path):
     config, job = described(tmp_path)
     half_m = f"{500 * nominal.TABLE_HEIGHT:g}"
     config.write_text(
@@ -129,7 +128,7 @@ def test_obstacles_of_configuration_and_job_are_solid(tmp_path: Path) -> None:
     assert {row["obstacle"] for row in truth(world)["collisions"]} == {"obstacle rack", "station obstacle fence"}
 
 
-def test_no_point_of_the_worlds_arm_reaches_beyond_the_bodies_that_the_cell_plans_with(world: World) -> None:
+def test_no_point_of_the_worlds_arm_reaches_beyond_the_bodies_that_the_cell_plans_with(world: World):
     """Two descriptions of one arm, each from the maker's table; else a planned way could be a collision."""
     grasp = load_job("pot")[0].grasp
     bodies = [*arm_bodies(), *tool_bodies(grasp.size, grasp.flange_from_part.se3())]

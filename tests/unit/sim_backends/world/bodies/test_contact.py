@@ -1,7 +1,5 @@
 """The part on the surface: forces of contact, where it comes to rest, and when the claw grips it."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -20,7 +18,7 @@ def stairs(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
     return 0.003 * np.floor(np.asarray(x) / 0.005), 0.0 * x, 0.0 * y
 
 
-def test_a_part_put_down_a_little_aside_lies_on_the_floor_of_the_steps() -> None:
+def test_a_part_put_down_a_little_aside_lies_on_the_floor_of_the_steps():
     ground = Surface("stairs", stairs, half_x=0.03, half_y=0.02, top=0.02)
     held = np.eye(4)
     held[2, 3] = 0.1
@@ -51,7 +49,7 @@ def raised(pose: np.ndarray, dx: float = 0.0, dz: float = 0.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("low", [0.0, 0.3e-3])
-def test_a_part_that_is_low_on_one_half_touches_as_much_earlier(tmp_path: Path, low: float) -> None:
+def test_a_part_that_is_low_on_one_half_touches_as_much_earlier(tmp_path, low: float):
     """By its own mesh, drawn in the part frame, which is turned and shifted against the surface's."""
     surface_from_part = turned((0.0, 0.0, 0.3), (0.004, -0.003, 0.002))
     back, drawn = drawing.inverse(surface_from_part), mesh("pot", 20_000, walls=False)
@@ -82,7 +80,7 @@ def test_a_part_that_is_low_on_one_half_touches_as_much_earlier(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("name", ["pot", "seat", "panel"])
-def test_no_force_before_contact_and_stiffness_times_depth_after(name: str) -> None:
+def test_no_force_before_contact_and_stiffness_times_depth_after(name: str):
     part, target = contact(name, lean=(0.0, 0.0, 0.0))
     assert not part.wrench(flange_for(raised(target, dz=1e-4))).any()
     at_depth = [part.wrench(flange_for(raised(target, dz=-depth)))[2] for depth in (1e-4, 2e-4)]
@@ -94,13 +92,13 @@ def test_no_force_before_contact_and_stiffness_times_depth_after(name: str) -> N
 @pytest.mark.parametrize(
     ("dz", "within"), [(0.0, 1e-8), (0.008, 1e-7), (-0.0004, 5e-6)], ids=["touching", "above", "pressed in"]
 )
-def test_wherever_the_claw_lets_go_of_it_the_part_comes_to_touch_the_surface(dz: float, within: float) -> None:
+def test_wherever_the_claw_lets_go_of_it_the_part_comes_to_touch_the_surface(dz: float, within: float):
     part, target = contact(lean=(0.0, 0.0, 0.0))
     part.set_claw(False, flange_for(raised(target, dz=dz)))
     assert not part.held and part.part_pose(np.eye(4)) == pytest.approx(target, abs=within)
 
 
-def test_a_surface_that_is_pushed_takes_along_what_lies_on_it_and_nothing_that_is_held() -> None:
+def test_a_surface_that_is_pushed_takes_along_what_lies_on_it_and_nothing_that_is_held():
     part, target = contact()
     held = part.part_pose(flange_for(raised(target, dz=0.2)))
     part.slide(raised(target, dx=0.005))
@@ -110,7 +108,7 @@ def test_a_surface_that_is_pushed_takes_along_what_lies_on_it_and_nothing_that_i
     assert part.part_pose(np.eye(4)) == pytest.approx(raised(target, dx=0.02), abs=1e-8)
 
 
-def test_a_part_that_a_person_takes_is_neither_in_the_claw_nor_near() -> None:
+def test_a_part_that_a_person_takes_is_neither_in_the_claw_nor_near():
     part, target = contact()
     part.take_away()
     assert not part.held and not part.untouched
@@ -119,7 +117,7 @@ def test_a_part_that_a_person_takes_is_neither_in_the_claw_nor_near() -> None:
     assert not part.held
 
 
-def test_a_part_put_down_beside_its_place_rests_higher_on_its_first_contact() -> None:
+def test_a_part_put_down_beside_its_place_rests_higher_on_its_first_contact():
     part, target = contact()
     part.set_claw(False, flange_for(raised(target, dx=0.002, dz=0.002)))
     rest = part.part_pose(np.eye(4))
@@ -134,7 +132,7 @@ def test_a_part_put_down_beside_its_place_rests_higher_on_its_first_contact() ->
     assert gap.min() > -2e-5 and gap.min() < 2e-4
 
 
-def test_the_claw_grips_again_only_within_its_reach() -> None:
+def test_the_claw_grips_again_only_within_its_reach():
     part, target = contact()
     part.set_claw(False, flange_for(target))
     part.set_claw(True, flange_for(raised(target, dz=0.02)))
@@ -146,7 +144,7 @@ def test_the_claw_grips_again_only_within_its_reach() -> None:
     assert lifted == pytest.approx(raised(target, dz=0.1), abs=1e-9)
 
 
-def test_a_part_lies_at_first_is_taken_into_its_nest_and_rides_with_the_vehicle() -> None:
+def test_a_part_lies_at_first_is_taken_into_its_nest_and_rides_with_the_vehicle():
     base = [np.eye(4)]
     nest = Nest(
         turned((0.0, 0.0, 0.5), (-0.6, 0.1, 0.7)), lambda: base[0], turned((0.0, 0.0, 0.01), (0.4e-3, 0.0, 0.0))
@@ -171,7 +169,7 @@ def test_a_part_lies_at_first_is_taken_into_its_nest_and_rides_with_the_vehicle(
     assert part.held, "it is taken from there as well"
 
 
-def test_a_part_that_sticks_holds_on_until_it_is_half_a_millimetre_away() -> None:
+def test_a_part_that_sticks_holds_on_until_it_is_half_a_millimetre_away():
     part, world_from_surface = contact(lean=(0.0, 0.0, 0.0))
     part.sticks = 30.0
     pulls = [-part.wrench(flange_for(raised(world_from_surface, dz=height)))[2] for height in (25e-6, 2e-4, 6e-4)]

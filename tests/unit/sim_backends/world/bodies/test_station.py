@@ -1,7 +1,6 @@
 """A station's bodies: with a mesh of the part the part's own underside, without one the surface's."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from sim_backends.world.bodies.surfaces import surface
 from sim_backends.world.drawing import STOCK, read, settled
 
 
-def test_the_underside_of_a_part_is_that_of_its_mesh(tmp_path: Path) -> None:
+def test_the_underside_of_a_part_is_that_of_its_mesh(tmp_path):
     assert Station.of(STOCK.station).part is None
     job_with_part(tmp_path, "pot", lambda corners: corners - np.array([0.0, 0.0, 0.001]))
     drawn = replace(STOCK.station, part_mesh=str(tmp_path / "pot-part.ply"), part_mesh_unit="m")
@@ -23,12 +22,12 @@ def test_the_underside_of_a_part_is_that_of_its_mesh(tmp_path: Path) -> None:
     np.testing.assert_allclose(-part.relief(x, y)[0], below, atol=30e-6)
 
 
-def test_a_mesh_that_is_none_is_told_by_its_path(tmp_path: Path) -> None:
+def test_a_mesh_that_is_none_is_told_by_its_path(tmp_path):
     with pytest.raises(ValueError, match=r"none\.stl cannot be read"):
         Station.of(replace(STOCK.station, part_mesh=str(tmp_path / "none.stl")))
 
 
-def test_a_wave_lies_on_what_is_felt_and_on_what_is_seen() -> None:
+def test_a_wave_lies_on_what_is_felt_and_on_what_is_seen():
     drawn = replace(STOCK, station=replace(STOCK.station, waviness=(0.1e-3, 0.012, 0.5)))
     plain, waved = Station.of(STOCK.station), Station.of(read(settled(drawn, STOCK).as_json()).station)
 

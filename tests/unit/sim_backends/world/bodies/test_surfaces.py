@@ -15,7 +15,7 @@ def grid(name: str, margin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_slopes_are_the_derivatives_of_the_height(name: str) -> None:
+def test_slopes_are_the_derivatives_of_the_height(name: str):
     x, y = grid(name, 0.001)
     _, gx, gy = surface(name).relief(x, y)
     step = 1e-7
@@ -25,7 +25,7 @@ def test_slopes_are_the_derivatives_of_the_height(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_mesh_lies_on_the_closed_form_and_closes_down_to_the_table(name: str) -> None:
+def test_mesh_lies_on_the_closed_form_and_closes_down_to_the_table(name: str):
     made = mesh(name)
     x, y, z = made.vertices.T
     top = z > 0
@@ -40,7 +40,7 @@ def test_mesh_lies_on_the_closed_form_and_closes_down_to_the_table(name: str) ->
     )
 
 
-def test_unknown_names_and_coarse_meshes_are_refused() -> None:
+def test_unknown_names_and_coarse_meshes_are_refused():
     with pytest.raises(ValueError, match="panel, pot, seat"):
         surface("vase")
     with pytest.raises(ValueError, match="100 or more"):

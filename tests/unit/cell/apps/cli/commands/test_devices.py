@@ -11,7 +11,7 @@ from cell.apps.doctor import DoctorCheck
 from cell.config.cell_config import default_toml
 
 
-def test_a_jog_without_a_motion_and_a_recovery_by_nobody_say_what_they_lack(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_jog_without_a_motion_and_a_recovery_by_nobody_say_what_they_lack(monkeypatch):
     refused = CliRunner().invoke(app, ["jog"])
     assert "say what to move" in str(refused.exception) and "--sim all" in str(refused.exception)
     monkeypatch.setattr("cell.run.session.supervisor.Cell.open", lambda *_, **__: pytest.fail("the cell was opened"))
@@ -19,7 +19,7 @@ def test_a_jog_without_a_motion_and_a_recovery_by_nobody_say_what_they_lack(monk
     assert "a person has to look at the cell first" in str(refused.exception)
 
 
-def test_only_what_the_configured_cell_needs_ends_with_1(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_what_the_configured_cell_needs_ends_with_1(here: Path, monkeypatch):
     without = json.loads(CliRunner().invoke(app, ["doctor", "--json"]).stdout)
     assert {row["what"] for row in without if row["state"] == "wrong"} <= {"packages", "disk"}
     # It reads the metadata of every package that is installed.

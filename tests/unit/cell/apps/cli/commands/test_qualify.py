@@ -33,14 +33,14 @@ class Quick:
 
 
 @pytest.fixture
-def quick(here: Path, monkeypatch: pytest.MonkeyPatch) -> Quick:
+def quick(here: Path, monkeypatch) -> Quick:
     made = Quick()
     monkeypatch.setattr(workers, "open_workers", lambda *_: made)
     monkeypatch.setattr("cell.apps.qualify.page.plots_of", lambda *_: [])
     return made
 
 
-def test_it_prints_the_answer_and_leaves_page_rows_and_line(quick: Quick, here: Path, typed: Typed) -> None:
+def test_it_prints_the_answer_and_leaves_page_rows_and_line(quick: Quick, here: Path, typed: Typed):
     code, out, _ = typed("qualify", "pot", "--seeds", "6")
     assert code == 0
     for words in ("how 6 worlds of nominal ended", "[54.1, 100.0] %", "place error, largest", "≤ 0.6", "cycle time"):
@@ -50,7 +50,7 @@ def test_it_prints_the_answer_and_leaves_page_rows_and_line(quick: Quick, here: 
     assert (here / "calibrations" / "qualified" / "pot.qualified.json").is_file()
 
 
-def test_more_seeds_are_added_and_json_says_the_same(quick: Quick, here: Path, typed: Typed) -> None:
+def test_more_seeds_are_added_and_json_says_the_same(quick: Quick, here: Path, typed: Typed):
     typed("qualify", "pot", "--seeds", "6")
     code, out, _ = typed("qualify", "pot", "--seeds", "10", "--json")
     told = json.loads(out)
@@ -58,7 +58,7 @@ def test_more_seeds_are_added_and_json_says_the_same(quick: Quick, here: Path, t
     assert told["line"].endswith("10 worlds of nominal, yield 100.0 % [69.2, 100.0]")
 
 
-def test_ctrl_c_keeps_the_rows(quick: Quick, here: Path, typed: Typed) -> None:
+def test_ctrl_c_keeps_the_rows(quick: Quick, here: Path, typed: Typed):
     quick.ends_at = 4
     code, out, complaints = typed("qualify", "pot", "--seeds", "6")
     assert (code, out) == (130, "")
@@ -70,13 +70,13 @@ def test_ctrl_c_keeps_the_rows(quick: Quick, here: Path, typed: Typed) -> None:
 )
 def test_an_error_and_a_part_that_nobody_noticed_outside_its_tolerance_fail(
     quick: Quick, typed: Typed, outcome: str, error_mm: float, code: int, unnoticed: int
-) -> None:
+):
     quick.outcome, quick.error_mm = outcome, error_mm
     ended, out, _ = typed("qualify", "--seeds", "2", "--json")
     assert (ended, json.loads(out)["unnoticed"]["count"]) == (code, unnoticed)
 
 
-def test_campaigns_are_compared(quick: Quick, here: Path, typed: Typed) -> None:
+def test_campaigns_are_compared(quick: Quick, here: Path, typed: Typed):
     typed("qualify", "--seeds", "3", "--out", "before")
     quick.error_mm = 0.2
     code, out, _ = typed("qualify", "--seeds", "4", "--compare", "before", "--json")
@@ -97,7 +97,7 @@ def test_campaigns_are_compared(quick: Quick, here: Path, typed: Typed) -> None:
         (("nothing",), "neither a file"),
     ],
 )
-def test_what_cannot_be_is_told(quick: Quick, typed: Typed, words: tuple[str, ...], told: str) -> None:
+def test_what_cannot_be_is_told(quick: Quick, typed: Typed, words: tuple[str, ...], told: str):
     code, out, complaints = typed("qualify", *words)
     assert (code, out) == (2, "")
     assert told in complaints

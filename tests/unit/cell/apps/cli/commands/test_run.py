@@ -46,9 +46,9 @@ def interrupted_as_it_is_closed() -> Iterator[None]:
     ],
 )
 def test_the_outcome_stays_true_and_the_exit_code_tells_of_the_signal(
-    tmp_path: Path, how: str, number: int | None, opened: Opened, code: int, said: str,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    tmp_path, how: str, number: int | None, opened: Opened, code: int, said: str,
+    capsys,
+):  # fmt: skip
     with pytest.raises(typer.Exit) as ended:
         _perform(opened, lambda cell, display: outcome(tmp_path, how, number), False, False)
     shown = capsys.readouterr()
@@ -57,7 +57,7 @@ def test_the_outcome_stays_true_and_the_exit_code_tells_of_the_signal(
     assert shown.err.strip() == said
 
 
-def test_an_interrupt_before_there_is_an_outcome_goes_on_to_the_top() -> None:
+def test_an_interrupt_before_there_is_an_outcome_goes_on_to_the_top():
     def work(cell: object, display: object) -> RunOutcome:
         raise SignalInterrupt(signal.SIGTERM)
 
@@ -65,7 +65,7 @@ def test_an_interrupt_before_there_is_an_outcome_goes_on_to_the_top() -> None:
         _perform(nullcontext, work, False, False)
 
 
-def test_a_dry_run_is_resumed_in_its_own_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dry_run_is_resumed_in_its_own_world(tmp_path, monkeypatch):
     """Also in world 0."""
     before = SimpleNamespace(info={"simulated": True, "seed": 0, "clock": "virtual"}, job="pot", folder=tmp_path)
     opened = Mock(side_effect=ConfigError("seen enough"))

@@ -34,11 +34,11 @@ class Terminal(io.StringIO):
 
 
 @pytest.fixture(autouse=True)
-def nobody_at_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+def nobody_at_a_terminal(monkeypatch) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO())
 
 
-def test_a_word_for_an_earlier_question_is_refused_and_the_present_one_is_shown(waiting: Journal, typed: Typed) -> None:
+def test_a_word_for_an_earlier_question_is_refused_and_the_present_one_is_shown(waiting: Journal, typed: Typed):
     code, _, said = typed(*CONFIRM, "--question", "1")
     assert code == 2
     assert "does not wait for question 1 but for question 2: stopped while placing" in said
@@ -47,9 +47,7 @@ def test_a_word_for_an_earlier_question_is_refused_and_the_present_one_is_shown(
     assert waiting.take_requests() == [RunRequest("confirm", "Bob", 2)]
 
 
-def test_without_a_number_the_question_that_waits_now_is_shown_and_that_one_is_answered(
-    waiting: Journal, typed: Typed
-) -> None:
+def test_without_a_number_the_question_that_waits_now_is_shown_and_that_one_is_answered(waiting: Journal, typed: Typed):
     code, out, _ = typed(*CONFIRM)
     assert (code, "question 2: stopped while placing" in out) == (0, True)
     assert waiting.take_requests() == [RunRequest("confirm", "Bob", 2)]
@@ -57,16 +55,14 @@ def test_without_a_number_the_question_that_waits_now_is_shown_and_that_one_is_a
 
 @pytest.mark.parametrize(("answer", "code"), [("n\n", 1), ("y\n", 0)])
 def test_a_person_at_a_terminal_is_asked_whether_it_is_the_one_that_was_meant(
-    waiting: Journal, monkeypatch: pytest.MonkeyPatch, typed: Typed, answer: str, code: int
-) -> None:
+    waiting: Journal, monkeypatch, typed: Typed, answer: str, code: int
+):
     monkeypatch.setattr("sys.stdin", Terminal(answer))
     assert typed(*CONFIRM)[0] == code
     assert len(waiting.take_requests()) == (1 if code == 0 else 0)
 
 
-def test_who_watches_a_run_sees_the_number_and_what_to_type(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_who_watches_a_run_sees_the_number_and_what_to_type(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "200")
     display = ProgressDisplay()
     display(Event("confirm_needed", "place", {"reason": "the arm has stopped", "code": "x", "number": 2}))

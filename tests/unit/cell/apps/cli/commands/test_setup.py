@@ -11,7 +11,7 @@ from cell.config.job import shipped_jobs
 
 
 @pytest.mark.parametrize("job", shipped_jobs())
-def test_what_init_writes_passes_the_check_and_is_not_overwritten(here: Path, job: str) -> None:
+def test_what_init_writes_passes_the_check_and_is_not_overwritten(here: Path, job: str):
     assert CliRunner().invoke(app, ["init", "own", "--job", job]).exit_code == 0
     written = {path.name: path.read_bytes() for path in (here / "own").iterdir()}
     assert {"cell.toml", f"{job}.toml"} < written.keys()

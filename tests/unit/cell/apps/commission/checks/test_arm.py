@@ -9,7 +9,7 @@ from sim_backends.clock import SteppedClock
 from sim_backends.models.arm import ArmModel, ArmParams
 
 
-def test_what_is_carried_is_weighed_apart_from_the_sensors_zero() -> None:
+def test_what_is_carried_is_weighed_apart_from_the_sensors_zero():
     zero, mass, moment = np.array([3.0, -2.0, 5.0, 0.1, 0.2, -0.3]), 1.7, np.array([0.02, -0.01, 0.15])
     turns, wrenches = [], []
     for axis in ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.0, 0.6, 0.0)):
@@ -25,7 +25,7 @@ def test_what_is_carried_is_weighed_apart_from_the_sensors_zero() -> None:
     assert sigma == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_simulated_arm_feels_the_weight_that_it_was_not_told_of_and_takes_it_as_zero_when_asked() -> None:
+def test_a_simulated_arm_feels_the_weight_that_it_was_not_told_of_and_takes_it_as_zero_when_asked():
     arm = ArmModel(ArmParams(carried=3.0, carried_centre=(0.0, 0.0, 0.1)), np.random.default_rng(1), SteppedClock())
     assert arm.felt == pytest.approx(np.zeros(6))
     arm.payload = (2.0, np.array([0.0, 0.0, 0.1]))

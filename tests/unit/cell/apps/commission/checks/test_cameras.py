@@ -26,7 +26,7 @@ def figures(image: np.ndarray) -> set[str]:
     return {row.what for row in result.readings if not row.ok}
 
 
-def test_light_and_focus_are_judged_by_the_board_alone() -> None:
+def test_light_and_focus_are_judged_by_the_board_alone():
     board = np.full((200, 240), 200, np.uint8)
     for x in range(40, 220, 25):
         for y in range(40, 180, 25):
@@ -42,11 +42,11 @@ def test_light_and_focus_are_judged_by_the_board_alone() -> None:
 @pytest.mark.parametrize(
     ("times", "name"), [(1.25, "marked_dots:9x7:25mm"), (1.201, "marked_dots:9x7:24mm"), (1.0, "marked_dots:9x7:20mm")]
 )
-def test_a_board_of_another_size_is_named_by_a_pitch_that_is_made(times: float, name: str) -> None:
+def test_a_board_of_another_size_is_named_by_a_pitch_that_is_made(times: float, name: str):
     assert renamed(parse_board("marked_dots:9x7:20mm"), times) == name
 
 
-def test_a_pose_is_told_and_written_in_millimetres_and_degrees() -> None:
+def test_a_pose_is_told_and_written_in_millimetres_and_degrees():
     pose = from_parts((0.0901, -0.05, 0.08), pin.rpy.rpyToMatrix(0.0, 0.0, math.radians(90.0)))
     assert pose_words(pose) == "(90.1, -50, 80) mm, (0, 0, 90) deg"
     told = tomllib.loads(f"pose = {pose_toml(pose)}")["pose"]

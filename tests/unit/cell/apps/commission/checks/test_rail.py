@@ -1,7 +1,6 @@
 """Which way and how far a rail goes is judged by its camera, its switches by what they do."""
 
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ def judged(told: float, moved: tuple[float, float, float]) -> list[str]:
     return [f"{finding.name} {finding.write}" for finding in result.findings]
 
 
-def test_a_rail_is_judged_by_the_way_that_its_camera_went() -> None:
+def test_a_rail_is_judged_by_the_way_that_its_camera_went():
     assert (judged(0.005, (4.97, 0.05, -0.1)), judged(-0.005, (-4.97, 0.05, -0.1))) == ([], [])
     assert judged(0.005, (-5.02, 0.1, 0.0)) == ["rail.reversed {'rail.reversed': 'true'}"]
     assert judged(0.005, (9.95, 0.1, 0.0)) == ["rail.lead {'rail.lead': '\"4 mm\"'}"]
@@ -35,7 +34,7 @@ def test_a_rail_is_judged_by_the_way_that_its_camera_went() -> None:
         judged(0.005, (0.02, 0.01, 0.0))
 
 
-def test_a_rail_whose_motor_turns_backwards_is_nudged_but_finds_no_zero_until_it_is_turned_round() -> None:
+def test_a_rail_whose_motor_turns_backwards_is_nudged_but_finds_no_zero_until_it_is_turned_round():
     config, described = load_config(None), Described.of("pot")
     backwards = config.model_copy(update={"rail": config.rail.model_copy(update={"reversed": True})})
     cell = VirtualCell(config, SEED, described=described, truth=backwards)
@@ -52,7 +51,7 @@ def test_a_rail_whose_motor_turns_backwards_is_nudged_but_finds_no_zero_until_it
     assert right.world.rail.carriage(right.clock.now()) == pytest.approx(0.0, abs=1e-4)
 
 
-def test_limit_switches_that_are_exchanged_are_found_by_name_short_of_the_end_stop(tmp_path: Path) -> None:
+def test_limit_switches_that_are_exchanged_are_found_by_name_short_of_the_end_stop(tmp_path):
     files(tmp_path)
     made, result = opened(tmp_path, Shown()), Result()
     with closing(made.workplace):

@@ -1,7 +1,6 @@
 """Each cause stops what moves or shines in a simulated cell, and a stop that comes late is measured."""
 
 from contextlib import closing
-from pathlib import Path
 
 import pytest
 
@@ -12,9 +11,7 @@ from tests.support.commissioning import Shown, files, opened
 
 
 @pytest.mark.parametrize("late_s", [0.0, 1.5])
-def test_time_and_way_until_rest_are_measured_for_each_cause(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, late_s: float
-) -> None:
+def test_time_and_way_until_rest_are_measured_for_each_cause(tmp_path, monkeypatch, late_s: float):
     files(tmp_path)
     made, result = opened(tmp_path, Shown()), Result()
     with closing(made.workplace):

@@ -1,7 +1,6 @@
 """What the board of a station says of the job and of the wheels."""
 
 from contextlib import closing
-from pathlib import Path
 
 from cell.apps.commission.check import Result
 from cell.apps.commission.checks.vehicle import judge_board
@@ -12,9 +11,7 @@ from tests.support.commissioning import Shown, files, opened
 from tests.support.described_cells import described
 
 
-def test_a_station_board_of_another_pitch_is_written_into_a_job_of_ones_own_and_not_into_one_that_ships(
-    tmp_path: Path,
-) -> None:
+def test_a_station_board_of_another_pitch_is_written_into_a_job_of_ones_own_and_not_into_one_that_ships(tmp_path):
     files(tmp_path)
     _, job = described(tmp_path / "own")
     check, shown = by_name("station"), Shown()

@@ -1,7 +1,6 @@
 """The first check of a cell, and a whole commissioning up to its first part."""
 
 from contextlib import closing
-from pathlib import Path
 
 import pytest
 
@@ -10,7 +9,7 @@ from tests.support.commissioning import Shown, commissioned, files, opened
 
 
 @pytest.mark.parametrize("clear", [True, False])
-def test_every_device_answers_is_named_and_well_and_a_person_has_looked_round(tmp_path: Path, clear: bool) -> None:
+def test_every_device_answers_is_named_and_well_and_a_person_has_looked_round(tmp_path, clear: bool):
     files(tmp_path)
     made = opened(tmp_path, Shown(), lambda text: clear)
     with closing(made.workplace):
@@ -21,7 +20,7 @@ def test_every_device_answers_is_named_and_well_and_a_person_has_looked_round(tm
 
 
 @pytest.mark.campaign
-def test_a_cell_on_which_nothing_is_wrong_is_commissioned_up_to_its_first_part(tmp_path: Path) -> None:
+def test_a_cell_on_which_nothing_is_wrong_is_commissioned_up_to_its_first_part(tmp_path):
     files(tmp_path, lambda text: text)
     good, shown = commissioned(tmp_path, "job_part")
     assert good

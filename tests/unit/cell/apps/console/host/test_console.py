@@ -5,7 +5,6 @@ import os
 import signal
 import threading
 import time
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -29,7 +28,7 @@ def state(page: Any, true: Any) -> dict[str, Any]:
             return told
 
 
-def test_a_page_sees_holds_and_stops_and_another_one_takes_over(cell: Cell, console: Console) -> None:
+def test_a_page_sees_holds_and_stops_and_another_one_takes_over(cell: Cell, console: Console):
     ann = Browser(console.link)
     assert ann.ask("GET", "/api/cell").words["name"] == cell.config.cell.name
     assert ann.ask("GET", "/api/cell?job=seat").words["job"] == "seat"
@@ -58,7 +57,7 @@ def test_a_page_sees_holds_and_stops_and_another_one_takes_over(cell: Cell, cons
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.0.2.7", "::", "localhost"])
-def test_another_address_needs_a_token_and_tls(tmp_path: Path, host: str) -> None:
+def test_another_address_needs_a_token_and_tls(tmp_path, host: str):
     token = tmp_path / "token"
     token.write_text("x" * 40)
     token.chmod(0o600)
@@ -68,7 +67,7 @@ def test_another_address_needs_a_token_and_tls(tmp_path: Path, host: str) -> Non
 
 
 @pytest.mark.parametrize(("text", "mode"), [("short", 0o600), ("x" * 40, 0o644), ("", 0o600), ("x y" * 20, 0o600)])
-def test_a_token_that_others_know_or_guess_is_refused_and_not_shown(tmp_path: Path, text: str, mode: int) -> None:
+def test_a_token_that_others_know_or_guess_is_refused_and_not_shown(tmp_path, text: str, mode: int):
     token = tmp_path / "token"
     token.write_text(text)
     token.chmod(mode)
@@ -77,7 +76,7 @@ def test_a_token_that_others_know_or_guess_is_refused_and_not_shown(tmp_path: Pa
     assert not text or text not in str(refused.value)
 
 
-def test_a_question_about_a_job_that_a_command_began_ends_with_it(cell: Cell, console: Console) -> None:
+def test_a_question_about_a_job_that_a_command_began_ends_with_it(cell: Cell, console: Console):
     run, made = cell.begin("jog", lambda run: until(lambda: run.control.token.reason is not None)), list[object]()
     decide = console.script("pot").on_refusal
     with Browser(console.link).live():
@@ -92,7 +91,7 @@ def test_a_question_about_a_job_that_a_command_began_ends_with_it(cell: Cell, co
     run.ended(10)
 
 
-def test_ctrl_c_stops_the_cell_before_its_server_is_waited_for(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_stops_the_cell_before_its_server_is_waited_for(cell: Cell, monkeypatch):
     """A server that hangs is what makes somebody turn to Ctrl-C."""
     ended: list[str | None] = []
     close = ServerProcess.close

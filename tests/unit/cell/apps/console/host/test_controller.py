@@ -2,7 +2,6 @@
 
 import os
 import threading
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -41,7 +40,7 @@ def asked(questions: Questions, run: Run[Any]) -> tuple[list[object], threading.
     return made, thread
 
 
-def test_a_refusal_is_shown_with_its_numbers_and_the_choices_that_the_policy_allows() -> None:
+def test_a_refusal_is_shown_with_its_numbers_and_the_choices_that_the_policy_allows():
     questions, end = Questions(), threading.Event()
     run: Run[Any] = Run("job", lambda run: end.wait(10))
     made, thread = asked(questions, run)
@@ -74,7 +73,7 @@ def test_a_refusal_is_shown_with_its_numbers_and_the_choices_that_the_policy_all
     end.set()
 
 
-def test_a_run_that_is_ended_asks_no_more() -> None:
+def test_a_run_that_is_ended_asks_no_more():
     questions, end = Questions(), threading.Event()
     run: Run[Any] = Run("job", lambda run: end.wait(10))
     made, thread = asked(questions, run)
@@ -84,12 +83,12 @@ def test_a_run_that_is_ended_asks_no_more() -> None:
     end.set()
 
 
-def test_nobody_is_asked_where_nobody_looks() -> None:
+def test_nobody_is_asked_where_nobody_looks():
     decide = Questions().script(STEPS, seen=lambda: False).on_refusal
     assert decide("board_photo", Failure(Outcome.REFUSED, "no board")) is None
 
 
-def test_one_holds_the_others_see(controller: ConsoleController) -> None:
+def test_one_holds_the_others_see(controller: ConsoleController):
     assert "nobody" in str(refusal(controller, "c1", do="home"))
     assert controller.do("c1", {"do": "hold", "name": "  Ann\n\x07 "}) == {"ok": True, "text": "Ann holds the cell"}
     assert "Ann" in str(refusal(controller, "c2", do="hold", name="Bob"))
@@ -131,12 +130,12 @@ def test_one_holds_the_others_see(controller: ConsoleController) -> None:
         ({"do": "dry_run", "seed": -1}, ConfigError),
     ],
 )
-def test_what_is_wrong_is_refused(controller: ConsoleController, words: dict[str, Any], kind: type[CellError]) -> None:
+def test_what_is_wrong_is_refused(controller: ConsoleController, words: dict[str, Any], kind: type[CellError]):
     controller.do("c1", {"do": "hold", "name": "Ann"})
     assert type(refusal(controller, "c1", **words)) is kind
 
 
-def test_manual_mode_jogs_and_nothing_else_can_be_begun_meanwhile(cell: Cell, controller: ConsoleController) -> None:
+def test_manual_mode_jogs_and_nothing_else_can_be_begun_meanwhile(cell: Cell, controller: ConsoleController):
     controller.do("c1", {"do": "hold", "name": "Ann"})
     controller.do("c1", {"do": "manual", "on": True})
     assert controller.manual.on
@@ -153,7 +152,7 @@ def test_manual_mode_jogs_and_nothing_else_can_be_begun_meanwhile(cell: Cell, co
     assert until(lambda: not controller.manual.on)
 
 
-def test_a_stop_ends_manual_mode_and_then_somebody_has_to_look(cell: Cell, controller: ConsoleController) -> None:
+def test_a_stop_ends_manual_mode_and_then_somebody_has_to_look(cell: Cell, controller: ConsoleController):
     controller.do("c1", {"do": "hold", "name": "Ann"})
     controller.do("c1", {"do": "manual", "on": True})
     cell.stop()
@@ -164,8 +163,8 @@ def test_a_stop_ends_manual_mode_and_then_somebody_has_to_look(cell: Cell, contr
 
 
 def test_what_takes_long_to_begin_is_answered_at_once_and_not_begun_twice(
-    cell: Cell, controller: ConsoleController, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    cell: Cell, controller: ConsoleController, monkeypatch
+):
     told, slow = [], threading.Event()
 
     def start(*_: object, **__: object) -> Run[Any]:
@@ -188,9 +187,7 @@ def test_what_takes_long_to_begin_is_answered_at_once_and_not_begun_twice(
     assert "battery" in str(refusal(controller, "c1", do="start"))
 
 
-def test_a_stop_while_something_is_starting_ends_it(
-    cell: Cell, controller: ConsoleController, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_while_something_is_starting_ends_it(cell: Cell, controller: ConsoleController, monkeypatch):
     slow, begun = threading.Event(), list[Run[Any]]()
 
     def home(_: object) -> None:
@@ -208,9 +205,7 @@ def test_a_stop_while_something_is_starting_ends_it(
     cell.clear_stop("the test")
 
 
-def test_jobs_are_named_never_addressed(
-    controller: ConsoleController, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_jobs_are_named_never_addressed(controller: ConsoleController, tmp_path, monkeypatch):
     """Nothing of a file's text is told, and a pipe keeps nobody waiting."""
     elsewhere, here = tmp_path / "elsewhere", tmp_path / "here"
     for folder in (elsewhere, here):
@@ -240,7 +235,7 @@ def test_jobs_are_named_never_addressed(
      {"device": "claw"}, {"axis": "x" * 900}, {"surplus": 1}],
     ids=str,
 )  # fmt: skip
-def test_a_beat_that_is_not_understood_moves_nothing(controller: ConsoleController, wrong: dict[str, Any]) -> None:
+def test_a_beat_that_is_not_understood_moves_nothing(controller: ConsoleController, wrong: dict[str, Any]):
     beat = {"type": "jog", "press": 1, "device": "arm", "axis": "z", "sign": 1, "at": 1.0}
     with pytest.raises(ConfigError, match="not understood"):
         controller.beat("c1", beat | wrong)

@@ -18,7 +18,7 @@ from tests.support.console.server import Browser
 
 def test_when_the_server_is_killed_the_program_hears_of_it_and_nobody_holds(
     cell: Cell, console: Console, gone: threading.Event
-) -> None:
+):
     ann = Browser(console.link)
     with ann.live() as page:
         key = json.loads(page.recv(timeout=20))["key"]
@@ -31,7 +31,7 @@ def test_when_the_server_is_killed_the_program_hears_of_it_and_nobody_holds(
         assert console.controller.holders.holder is None
 
 
-def test_a_message_that_goes_wrong_ends_nothing(cell: Cell, console: Console, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_message_that_goes_wrong_ends_nothing(cell: Cell, console: Console, monkeypatch):
     """Whatever a handler raises: the next message is heard, and the held button is let go of."""
 
     def fail(*_: object) -> None:
@@ -47,7 +47,7 @@ def test_a_message_that_goes_wrong_ends_nothing(cell: Cell, console: Console, mo
         assert ann.do(do="leave", key=key).status == 403
 
 
-def test_the_server_ends_with_its_program(cell: Cell, console: Console) -> None:
+def test_the_server_ends_with_its_program(cell: Cell, console: Console):
     """Its pipes end, as they do when it is killed. While it was there, nobody else could have its port."""
     with pytest.raises(ConfigError, match="cannot listen"):
         Console(cell, "pot", Address(port=console.port))
@@ -58,9 +58,7 @@ def test_the_server_ends_with_its_program(cell: Cell, console: Console) -> None:
 
 
 @pytest.mark.parametrize("hung", ["beat", "joined"])
-def test_a_killed_server_is_noticed_whatever_the_other_threads_do(
-    cell: Cell, hung: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_server_is_noticed_whatever_the_other_threads_do(cell: Cell, hung: str, monkeypatch):
     """The thread that hears the server hangs in a message; another message is none that it could take."""
     gone, held = threading.Event(), threading.Event()
     with Console(cell, "pot", gone=gone.set) as console:

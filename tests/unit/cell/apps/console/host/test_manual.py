@@ -20,7 +20,7 @@ from tests.support import until
 Z_UP = ("arm", "z", 1)
 
 
-def test_a_press_lives_by_its_beats_and_never_twice() -> None:
+def test_a_press_lives_by_its_beats_and_never_twice():
     presses, beaten = Presses(), []
     press = presses.beat("c1", 7, *Z_UP)
     press.beat = lambda: beaten.append(time.monotonic())
@@ -35,7 +35,7 @@ def test_a_press_lives_by_its_beats_and_never_twice() -> None:
     assert presses.beat("c1", 6, *Z_UP) is None and presses.beat("c1", 8, *Z_UP) is not None
 
 
-def test_release_and_a_second_button_end_it() -> None:
+def test_release_and_a_second_button_end_it():
     presses = Presses()
     first = presses.beat("c1", 1, *Z_UP)
     presses.end("c1", "the button was let go of")
@@ -52,7 +52,7 @@ def test_release_and_a_second_button_end_it() -> None:
     assert third.over() is not None
 
 
-def test_another_page_ends_what_a_page_holds_and_begins_nothing() -> None:
+def test_another_page_ends_what_a_page_holds_and_begins_nothing():
     presses = Presses()
     press = presses.beat("c1", 1, *Z_UP)
     assert presses.beat("c2", 1, *Z_UP) is None
@@ -64,7 +64,7 @@ def test_another_page_ends_what_a_page_holds_and_begins_nothing() -> None:
     assert other.over() == "the page is gone"
 
 
-def test_a_beat_that_was_long_under_way_begins_nothing() -> None:
+def test_a_beat_that_was_long_under_way_begins_nothing():
     """The line stood still with a whole press in it: what comes out of it is old, by the page's own clock."""
     presses = Presses()
     at = 1e3 * time.monotonic()
@@ -74,7 +74,7 @@ def test_a_beat_that_was_long_under_way_begins_nothing() -> None:
     assert presses.beat("c1", 3, *Z_UP, at_ms=at) is not None
 
 
-def test_a_press_ends_when_the_watch_beside_the_device_is_lost() -> None:
+def test_a_press_ends_when_the_watch_beside_the_device_is_lost():
     def lost() -> None:
         raise InterlockError("rail", "the helper is gone")
 
@@ -85,7 +85,7 @@ def test_a_press_ends_when_the_watch_beside_the_device_is_lost() -> None:
     assert "the helper is gone" in str(press.over())
 
 
-def test_who_waits_for_the_end_hears_it_at_once() -> None:
+def test_who_waits_for_the_end_hears_it_at_once():
     presses = Presses()
     press = presses.beat("c1", 1, *Z_UP)
     threading.Timer(0.02, lambda: presses.end_all("stopped")).start()
@@ -98,8 +98,8 @@ def test_who_waits_for_the_end_hears_it_at_once() -> None:
 @pytest.mark.parametrize(("device", "axis"), [("arm", "z"), ("arm", "j1"), ("rail", "")])
 @pytest.mark.parametrize("end", ["release", "page gone", "another button", "manual off", "silence"])
 def test_what_ends_a_held_button_stops_the_motion(
-    cell: Cell, controller: ConsoleController, monkeypatch: pytest.MonkeyPatch, device: str, axis: str, end: str
-) -> None:
+    cell: Cell, controller: ConsoleController, monkeypatch, device: str, axis: str, end: str
+):
     """Virtual time passes here alone: what moves on after the end would be seen to."""
     cell.home("rail")
     told: list[str] = []
@@ -136,7 +136,7 @@ def test_what_ends_a_held_button_stops_the_motion(
     assert np.abs(place() - stood).max() < 1e-5
 
 
-def test_a_clock_of_the_page_that_goes_slow_makes_no_beat_late(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clock_of_the_page_that_goes_slow_makes_no_beat_late(monkeypatch):
     """60 ppm are .43 s after two hours. A line that is slow at once is told from that."""
     presses, now = Presses(), time.monotonic()
     for number in range(1, 120):
@@ -147,7 +147,7 @@ def test_a_clock_of_the_page_that_goes_slow_makes_no_beat_late(monkeypatch: pyte
 
 
 @pytest.mark.parametrize("end", ["manual off", "page gone"])
-def test_what_ends_manual_mode_stops_a_step_on_its_way(cell: Cell, controller: ConsoleController, end: str) -> None:
+def test_what_ends_manual_mode_stops_a_step_on_its_way(cell: Cell, controller: ConsoleController, end: str):
     controller.do("c1", {"do": "hold", "name": "Ann"})
     controller.do("c1", {"do": "manual", "on": True})
     before = cell.devices.arm.state().flange[2]

@@ -1,7 +1,6 @@
 """What is shown of a run that has ended."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -22,7 +21,7 @@ STEPS = ("board_photo", "laser_sweep", "reconstruct")
         ({"place_bound_95": None}, None),
     ],
 )
-def test_a_placed_job_ends_with_its_figure(tmp_path: Path, report: dict[str, Any], figure: object) -> None:
+def test_a_placed_job_ends_with_its_figure(tmp_path, report: dict[str, Any], figure: object):
     """The true error where a simulated world tells it, else the bound that was stated, said as such."""
 
     def work(run: Run[Any]) -> None:

@@ -38,7 +38,7 @@ def becomes(controller: ConsoleController, state: str) -> bool:
     return until(lambda: shown(controller).get("state") == state, seconds=60)
 
 
-def test_a_queue_holds_between_two_parts_goes_on_and_ends_when_it_is_told(controller: ConsoleController) -> None:
+def test_a_queue_holds_between_two_parts_goes_on_and_ends_when_it_is_told(controller: ConsoleController):
     assert controller.queue.as_dict() is None
     assert isinstance(refusal(controller, "c1", do="queue", parts="hold"), InterlockError)
     assert isinstance(refusal(controller, "c1", do="start", count=3, until="board_photo"), ConfigError)
@@ -62,7 +62,7 @@ def test_a_queue_holds_between_two_parts_goes_on_and_ends_when_it_is_told(contro
     assert isinstance(refusal(controller, "c1", do="queue", parts="run"), InterlockError)
 
 
-def test_a_stop_ends_a_queue_that_holds(controller: ConsoleController) -> None:
+def test_a_stop_ends_a_queue_that_holds(controller: ConsoleController):
     controller.do("c1", {"do": "start", "count": 2})
     controller.do("c1", {"do": "queue", "parts": "hold"})
     assert becomes(controller, "holding")

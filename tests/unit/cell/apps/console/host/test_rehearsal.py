@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -12,7 +11,7 @@ from drivers.errors import InterlockError
 from tests.support import running, until
 
 
-def test_a_dry_run_tells_how_far_it_is_and_can_be_cancelled(cell: Cell) -> None:
+def test_a_dry_run_tells_how_far_it_is_and_can_be_cancelled(cell: Cell):
     rehearsals = Rehearsals(cell)
     with pytest.raises(InterlockError):
         rehearsals.cancel()
@@ -25,7 +24,7 @@ def test_a_dry_run_tells_how_far_it_is_and_can_be_cancelled(cell: Cell) -> None:
     assert not running(process.pid)
 
 
-def test_a_dry_run_ends_with_its_input(tmp_path: Path) -> None:
+def test_a_dry_run_ends_with_its_input(tmp_path):
     """The console holds the other end, which closes with it."""
     command = [sys.executable, "-m", "cell.apps.console.host.rehearsal", "pot", "3", "nominal", ""]
     process = subprocess.Popen(command, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE)

@@ -4,7 +4,6 @@ import json
 import queue
 import random
 import socket
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -107,13 +106,13 @@ COUNTS = pytest.mark.parametrize("count", [600, pytest.param(50_000, marks=pytes
 
 
 @COUNTS
-def test_the_controller_answers_whatever_is_said(cell: Cell, count: int) -> None:
+def test_the_controller_answers_whatever_is_said(cell: Cell, count: int):
     with Console(cell, "pot") as console:
         desk_hears(console, count)
 
 
 @COUNTS
-def test_the_server_answers_whatever_is_said(tmp_path: Path, count: int) -> None:
+def test_the_server_answers_whatever_is_said(tmp_path, count: int):
     with serving(tmp_path) as server:
         socket_hears(server, count)
 
@@ -121,7 +120,7 @@ def test_the_server_answers_whatever_is_said(tmp_path: Path, count: int) -> None
 TOKEN = "a-token-of-a-file-that-is-long-enough-0123456789"
 
 
-def test_the_link_works_once_and_gives_a_cookie_that_no_script_sees(server: Served) -> None:
+def test_the_link_works_once_and_gives_a_cookie_that_no_script_sees(server: Served):
     _ = server.cookie
     link = server.tokens.get(timeout=10)
     first = server.ask("GET", f"/enter?token={link}", cookie=None)
@@ -135,7 +134,7 @@ def test_the_link_works_once_and_gives_a_cookie_that_no_script_sees(server: Serv
     assert "set-cookie" not in again.headers
 
 
-def test_a_link_works_once_also_before_the_next_is_made() -> None:
+def test_a_link_works_once_also_before_the_next_is_made():
     access = Access(("127.0.0.1",), 1, secure=False)
     replaced, link = access.link(), access.link()
     assert access.enter(replaced) is None and access.enter(link) is not None
@@ -144,11 +143,11 @@ def test_a_link_works_once_also_before_the_next_is_made() -> None:
 
 @pytest.mark.parametrize("path", ["/", "/static/app.js", "/api/cell", "/api/runs", "/api/trend", "/nowhere"])
 @pytest.mark.parametrize("cookie", [None, "cell_console=x", "a=b; cell_console_1=z", "\xff=\xfe", "x" * 5000])
-def test_without_the_cookie_there_is_nothing(server: Served, path: str, cookie: str | None) -> None:
+def test_without_the_cookie_there_is_nothing(server: Served, path: str, cookie: str | None):
     assert server.ask("GET", path, cookie=cookie).status == 401
 
 
-def test_a_cookie_alone_authorises_nothing(server: Served) -> None:
+def test_a_cookie_alone_authorises_nothing(server: Served):
     """Another server on this address is sent the cookie; the key it is not. A second link leaves the first one be."""
     cookie, key = server.enter()
     second = server.enter()
@@ -175,7 +174,7 @@ def test_a_cookie_alone_authorises_nothing(server: Served) -> None:
 
 
 @pytest.mark.parametrize("token", ["", "x", "é", "%00", "..%2f", "a" * 3000])
-def test_a_wrong_token_opens_nothing(server: Served, token: str) -> None:
+def test_a_wrong_token_opens_nothing(server: Served, token: str):
     path = "/enter?token=" + token if token.isascii() else "/enter?token=%C3%A9"
     assert server.ask("GET", path, cookie=None).status == 403
 
@@ -185,7 +184,7 @@ def test_a_wrong_token_opens_nothing(server: Served, token: str) -> None:
     ["evil.example", "127.0.0.1", "127.0.0.1:1", "localhost.evil.example:{port}", "127.0.0.1.evil.example:{port}",
      "127.0.0.1:{port}.evil.example", "evil@127.0.0.1:{port}", "[::1]:{port}", "0.0.0.0:{port}", "", None],
 )  # fmt: skip
-def test_another_name_is_not_answered(server: Served, host: str | None) -> None:
+def test_another_name_is_not_answered(server: Served, host: str | None):
     """So that no name that somebody else gives this computer (DNS rebinding) reaches it."""
     given = None if host is None else host.format(port=server.port)
     # One without any is turned away by the protocol itself.
@@ -193,7 +192,7 @@ def test_another_name_is_not_answered(server: Served, host: str | None) -> None:
     assert server.ask("POST", "/api/do", '{"do": "stop"}', host=given).status in (400, 421)
 
 
-def test_two_names_at_once_are_not_answered(server: Served) -> None:
+def test_two_names_at_once_are_not_answered(server: Served):
     request = f"GET /api/cell HTTP/1.1\r\nHost: {server.host}\r\nHost: {server.host}\r\nCookie: {server.cookie}\r\n"
     request += f"X-Cell-Key: {server.key}\r\n\r\n"
     assert server.raw(request.encode()).startswith((b"HTTP/1.1 421", b"HTTP/1.1 400"))
@@ -207,7 +206,7 @@ STRANGERS = [
 
 
 @pytest.mark.parametrize("origin", [*STRANGERS, None])
-def test_a_page_from_elsewhere_commands_nothing_and_sees_nothing(server: Served, origin: str | None) -> None:
+def test_a_page_from_elsewhere_commands_nothing_and_sees_nothing(server: Served, origin: str | None):
     before, given = server.stops, None if origin is None else origin.format(port=server.port)
     assert (server.ask("POST", "/api/do", '{"do": "stop"}', origin=given).status, server.stops) == (403, before)
     with pytest.raises(InvalidStatus) as refused:
@@ -217,13 +216,13 @@ def test_a_page_from_elsewhere_commands_nothing_and_sees_nothing(server: Served,
         assert server.ask("GET", "/api/cell", origin=given).status == 403
 
 
-def test_a_browser_that_says_that_another_site_asks_is_refused(server: Served) -> None:
+def test_a_browser_that_says_that_another_site_asks_is_refused(server: Served):
     assert server.ask("GET", "/api/cell", sec_fetch_site="cross-site").status == 403
     assert server.ask("POST", "/api/do", '{"do": "stop"}', sec_fetch_site="same-site").status == 403
     assert server.ask("GET", "/api/cell", sec_fetch_site="same-origin").status == 200
 
 
-def test_the_live_link_asks_the_same(server: Served) -> None:
+def test_the_live_link_asks_the_same(server: Served):
     link = socket.create_connection(("127.0.0.1", server.port))
     for options in ({"headers": {"cookie": "x=y"}}, {"url": f"ws://evil.example:{server.port}/live", "sock": link}):
         with pytest.raises(InvalidStatus) as refused:
@@ -231,7 +230,7 @@ def test_the_live_link_asks_the_same(server: Served) -> None:
         assert refused.value.response.status_code == 403
 
 
-def test_the_token_is_in_no_output_and_no_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_token_is_in_no_output_and_no_error(tmp_path, capfd):
     with serving(tmp_path, TOKEN) as server:
         for path in (f"/enter?token={TOKEN}x", f"/nowhere?token={TOKEN}", f"/static/{TOKEN}", f"/api/runs/{TOKEN}"):
             assert TOKEN not in server.ask("GET", path, cookie=None).text

@@ -11,7 +11,7 @@ from tests.support import until
 from tests.support.console.server import Served
 
 
-def test_names_that_are_too_long_are_refused_in_words(server: Served) -> None:
+def test_names_that_are_too_long_are_refused_in_words(server: Served):
     long, run = "x" * 5000, "/api/runs/20260101T000000-abcd"
     for path in (f"/api/runs/{long}", f"{run}/pictures/{long}.png", f"/static/{long}", f"/api/cell?job={long}"):
         assert server.ask("GET", path).status == 400
@@ -22,7 +22,7 @@ def test_names_that_are_too_long_are_refused_in_words(server: Served) -> None:
             assert (refused.status, refused.words["error"]) == (400, "ConfigError")
 
 
-def test_what_is_half_said_is_closed_within_ten_seconds(server: Served) -> None:
+def test_what_is_half_said_is_closed_within_ten_seconds(server: Served):
     """Half a head, half a body, half a second request, a refused one's body that never comes."""
     head = server.head()
     half = "Content-Length: 100\r\n\r\n{"
@@ -40,7 +40,7 @@ def test_what_is_half_said_is_closed_within_ten_seconds(server: Served) -> None:
                 pass
 
 
-def test_every_answer_lets_the_page_load_nothing_from_elsewhere(server: Served) -> None:
+def test_every_answer_lets_the_page_load_nothing_from_elsewhere(server: Served):
     for answer in (server.ask("GET", "/"), server.ask("GET", "/nowhere"), server.ask("GET", "/", cookie=None)):
         assert answer.headers["content-security-policy"].startswith("default-src 'self';")
         assert "unsafe" not in answer.headers["content-security-policy"]
@@ -50,13 +50,13 @@ def test_every_answer_lets_the_page_load_nothing_from_elsewhere(server: Served) 
 
 
 @pytest.mark.parametrize("method", ["GET", "HEAD", "PUT", "DELETE", "PATCH", "OPTIONS"])
-def test_only_a_post_changes_anything(server: Served, method: str) -> None:
+def test_only_a_post_changes_anything(server: Served, method: str):
     before = server.stops
     assert server.ask(method, "/api/do?do=stop", '{"do": "stop"}', origin=server.origin).status in (401, 405)
     assert server.stops == before
 
 
-def test_a_form_of_another_page_is_no_command(server: Served) -> None:
+def test_a_form_of_another_page_is_no_command(server: Served):
     before = server.stops
     for kind in ("text/plain", "application/x-www-form-urlencoded", "multipart/form-data", None):
         assert server.ask("POST", "/api/do", '{"do": "stop"}', content_type=kind).status == 415
@@ -64,17 +64,17 @@ def test_a_form_of_another_page_is_no_command(server: Served) -> None:
 
 
 @pytest.mark.parametrize("body", [b"", b"[]", b"1", b"{", b'{"do": ', b"\xff\xfe", b"[" * 4000, b'"stop"', b"null"])
-def test_what_is_not_understood_is_refused(server: Served, body: bytes) -> None:
+def test_what_is_not_understood_is_refused(server: Served, body: bytes):
     assert server.ask("POST", "/api/do", body).status == 400
 
 
-def test_a_command_has_a_largest_size_also_when_it_does_not_say_its_own(server: Served) -> None:
+def test_a_command_has_a_largest_size_also_when_it_does_not_say_its_own(server: Served):
     assert server.ask("POST", "/api/do", json.dumps({"do": "x" * 5000})).status == 413
     head, part = server.head("POST /api/do", "Transfer-Encoding: chunked", ""), b"1000\r\n" + b"x" * 4096 + b"\r\n"
     assert server.raw(head.encode() + 2 * part).startswith(b"HTTP/1.1 413")
 
 
-def test_a_command_needs_the_key_of_a_live_link_and_a_stop_does_not(server: Served) -> None:
+def test_a_command_needs_the_key_of_a_live_link_and_a_stop_does_not(server: Served):
     with server.live() as page:
         hello = json.loads(page.recv(timeout=10))
         assert (server.do(do="pause").status, server.do(do="pause", key="x" * 32).status) == (403, 403)
@@ -90,7 +90,7 @@ def test_a_command_needs_the_key_of_a_live_link_and_a_stop_does_not(server: Serv
     server.trouble = None
 
 
-def test_a_stop_waits_for_nothing_that_is_under_way(server: Served) -> None:
+def test_a_stop_waits_for_nothing_that_is_under_way(server: Served):
     """Commands that nobody answers keep it back no more than too many of them do."""
     with server.live() as page:
         key = json.loads(page.recv(timeout=10))["key"]
@@ -110,7 +110,7 @@ def test_a_stop_waits_for_nothing_that_is_under_way(server: Served) -> None:
             link.close()
 
 
-def test_two_hundred_connections_keep_nobody_out(server: Served) -> None:
+def test_two_hundred_connections_keep_nobody_out(server: Served):
     with ExitStack() as links:
         idle = [links.enter_context(socket.create_connection(("127.0.0.1", server.port))) for _ in range(200)]
         begun = time.monotonic()
@@ -127,5 +127,5 @@ def test_two_hundred_connections_keep_nobody_out(server: Served) -> None:
     ["/static/../serve.py", "/static/%2e%2e/serve.py", "/static/..%2fserve.py", "/api/runs/..%2f..%2fetc/replay",
      "/api/runs/20260101T000000-abcd/pictures/..%2f..%2fsecret.png", "/static//etc/passwd", "/api/runs/%00"],
 )  # fmt: skip
-def test_no_path_leads_out(server: Served, path: str) -> None:
+def test_no_path_leads_out(server: Served, path: str):
     assert server.ask("GET", path).status == 404

@@ -22,7 +22,7 @@ from tests.support.console.server import Served
      ("[]", 1007), ("{", 1007), ('{"type": 1}', 1007), ('{"type": "do"}', 1007), (b"\0\1", 1007),
      ('{"type": ' + "[" * 900, 1007)],
 )  # fmt: skip
-def test_a_page_that_talks_nonsense_is_put_out(server: Served, said: str | bytes, code: int) -> None:
+def test_a_page_that_talks_nonsense_is_put_out(server: Served, said: str | bytes, code: int):
     with server.live() as page:
         page.recv(timeout=10)
         page.send(said)
@@ -32,7 +32,7 @@ def test_a_page_that_talks_nonsense_is_put_out(server: Served, said: str | bytes
 
 
 @pytest.mark.parametrize("said", ['{"type": "jog_end", "press": 1}', '{"type": "stop"}'])
-def test_a_page_that_talks_too_much_is_put_out_and_lets_go(server: Served, said: str) -> None:
+def test_a_page_that_talks_too_much_is_put_out_and_lets_go(server: Served, said: str):
     server.forget()
     with server.live() as page:
         client = json.loads(page.recv(timeout=10))["id"]
@@ -47,7 +47,7 @@ def test_a_page_that_talks_too_much_is_put_out_and_lets_go(server: Served, said:
     assert sum(isinstance(message, Beat) for message in heard) < 300
 
 
-def test_a_page_that_is_lost_without_a_word_lets_go_within_seconds(server: Served) -> None:
+def test_a_page_that_is_lost_without_a_word_lets_go_within_seconds(server: Served):
     """Its cable is out: nothing is closed, nothing answers. Nobody else could take hold until it is given up."""
     server.forget()
     upgrade = "Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13"
@@ -61,7 +61,7 @@ def test_a_page_that_is_lost_without_a_word_lets_go_within_seconds(server: Serve
         assert server.heard.get(timeout=2.5 * PING_S) == Left(joined.client)
 
 
-def test_broken_frames_and_half_an_upgrade_hurt_nobody(server: Served) -> None:
+def test_broken_frames_and_half_an_upgrade_hurt_nobody(server: Served):
     with server.live() as page:
         page.recv(timeout=10)
         page.socket.sendall(b"\xff\xff\xff\xff\xff\xff")
@@ -71,7 +71,7 @@ def test_broken_frames_and_half_an_upgrade_hurt_nobody(server: Served) -> None:
     assert server.ask("GET", "/api/cell").status == 200
 
 
-def test_more_pages_than_there_is_room_for_are_told_so(server: Served) -> None:
+def test_more_pages_than_there_is_room_for_are_told_so(server: Served):
     with ExitStack() as pages:
         for _ in range(16):
             pages.enter_context(server.live()).recv(timeout=10)
@@ -80,7 +80,7 @@ def test_more_pages_than_there_is_room_for_are_told_so(server: Served) -> None:
         assert closed.value.rcvd is not None and closed.value.rcvd.code == 1013
 
 
-def test_who_reads_slowly_sees_the_newest_and_holds_nobody_up(server: Served) -> None:
+def test_who_reads_slowly_sees_the_newest_and_holds_nobody_up(server: Served):
     """The state and pictures: the newest. The cloud: every increment, up to a bound."""
     big = "x" * 60_000
     # What it never reads would keep its close waiting.
@@ -108,7 +108,7 @@ def _states(page: object, last: int) -> list[int]:
     return seen
 
 
-def test_the_mailbox_keeps_the_newest_and_of_the_cloud_as_much_as_it_may() -> None:
+def test_the_mailbox_keeps_the_newest_and_of_the_cloud_as_much_as_it_may():
     async def fill() -> list[str | bytes]:
         mailbox = Mailbox()
         for n in range(500):

@@ -25,7 +25,7 @@ def status(pid: int, what: str) -> int:
     # the one slot for all of them.
     [(2.0, 200.0), pytest.param(60.0, 1000.0, marks=pytest.mark.campaign)],
 )
-def test_a_stop_is_carried_out_in_a_flood(tmp_path: Path, seconds: float, least_rate: float) -> None:
+def test_a_stop_is_carried_out_in_a_flood(tmp_path, seconds: float, least_rate: float):
     """Pressed three times a second during a flood; each is carried out, and begun, in time."""
     with serving(tmp_path) as server:
         server.stop_s = 0.1
@@ -47,7 +47,7 @@ def test_a_stop_is_carried_out_in_a_flood(tmp_path: Path, seconds: float, least_
     assert after["VmRSS"][0] - before["VmRSS"][0] < 20_000
 
 
-def test_stops_at_once_have_one_stop_in_common(tmp_path: Path) -> None:
+def test_stops_at_once_have_one_stop_in_common(tmp_path):
     """One is under way, all others wait for the next one; each is answered."""
     with serving(tmp_path) as server:
         server.stop_s = 0.3
@@ -68,7 +68,7 @@ def test_stops_at_once_have_one_stop_in_common(tmp_path: Path) -> None:
             assert before < server.stops <= before + 4
 
 
-def test_a_stop_that_a_device_does_not_confirm_holds_up_no_other(tmp_path: Path) -> None:
+def test_a_stop_that_a_device_does_not_confirm_holds_up_no_other(tmp_path):
     with serving(tmp_path) as server:
         server.stop_s = 1.5
         _ = server.cookie

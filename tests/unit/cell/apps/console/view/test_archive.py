@@ -1,7 +1,6 @@
 """Runs and their replay, read from their folders."""
 
 import os
-from pathlib import Path
 
 import pytest
 
@@ -10,7 +9,7 @@ from cell.run.folder import list_runs
 from cell.run.session.supervisor import Cell
 
 
-def test_runs_of_the_archive_are_read_from_their_folders(tmp_path: Path) -> None:
+def test_runs_of_the_archive_are_read_from_their_folders(tmp_path):
     folder = tmp_path / "20260101T000000-abcd"
     (folder / "frames").mkdir(parents=True)
     (folder / "frames" / "board-01-000001.png").write_bytes(b"png")
@@ -47,12 +46,12 @@ def test_runs_of_the_archive_are_read_from_their_folders(tmp_path: Path) -> None
     assert archive.run(piped.name) is None and archive.run("20260103T000000-abcd") is None
 
 
-def test_the_cells_health_is_what_the_command_tells(tmp_path: Path) -> None:
+def test_the_cells_health_is_what_the_command_tells(tmp_path):
     told = Archive(tmp_path, tmp_path, 86_400.0).health()
     assert told is not None and (told["parts"], told["due"]) == ([], "no job has run yet: nothing is known")
 
 
-def test_a_run_that_no_console_has_seen_is_replayed_from_its_record(cell: Cell) -> None:
+def test_a_run_that_no_console_has_seen_is_replayed_from_its_record(cell: Cell):
     cell.home()
     folder = list_runs(cell.runs_folder)[-1]
     archive = Archive(cell.runs_folder, cell.runs_folder, 86_400.0)

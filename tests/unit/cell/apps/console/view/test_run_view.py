@@ -13,7 +13,7 @@ from statemachine.step import Event
 STEPS = ("board_photo", "laser_sweep", "reconstruct")
 
 
-def test_a_run_is_followed_by_its_own_events() -> None:
+def test_a_run_is_followed_by_its_own_events():
     seen, begun, end = threading.Event(), threading.Event(), threading.Event()
 
     def work(run: Run[Any]) -> None:

@@ -46,13 +46,13 @@ def turned(drawn: dict[str, Any], joints: NDArray[np.float64]) -> list[NDArray[n
     return [*frames, frames[-1] @ matrix(drawn["arm"]["joint6_from_flange"])]
 
 
-def test_the_drawn_flange_is_where_the_simulated_arm_has_it(drawn: dict[str, Any]) -> None:
+def test_the_drawn_flange_is_where_the_simulated_arm_has_it(drawn: dict[str, Any]):
     arm = Kinematics(UR10E_DH)
     for joints in POSTURES:
         np.testing.assert_allclose(turned(drawn, joints)[-1], arm.forward(joints), atol=1e-7)
 
 
-def test_links_join_where_the_arm_bends(drawn: dict[str, Any]) -> None:
+def test_links_join_where_the_arm_bends(drawn: dict[str, Any]):
     """The capsules of upper arm and forearm meet in the elbow's, whatever the posture: each is in the right frame."""
     bodies = {body["name"]: body for body in drawn["bodies"]}
 
@@ -70,7 +70,7 @@ def test_links_join_where_the_arm_bends(drawn: dict[str, Any]) -> None:
             assert apart < bodies["elbow"]["radius"]
 
 
-def test_the_station_is_in_its_own_frame_and_the_surface_looks_like_its_mesh(drawn: dict[str, Any]) -> None:
+def test_the_station_is_in_its_own_frame_and_the_surface_looks_like_its_mesh(drawn: dict[str, Any]):
     station, (job, _) = drawn["station"], load_job("pot")
     # Where the vehicle ends, the place is in reach in front of the arm; where it starts, it is not.
     reach = np.abs(UR10E_DH[:, :2]).sum()
@@ -85,7 +85,7 @@ def test_the_station_is_in_its_own_frame_and_the_surface_looks_like_its_mesh(dra
     np.testing.assert_allclose(next(b["size"] for b in drawn["bodies"] if b["name"] == "part"), job.grasp.size)
 
 
-def test_a_mesh_is_made_coarser_without_leaving_its_place() -> None:
+def test_a_mesh_is_made_coarser_without_leaving_its_place():
     x, y = np.meshgrid(np.linspace(0, 0.1, 201), np.linspace(0, 0.05, 101))
     sphere = np.sqrt(0.5**2 - (x - 0.05) ** 2 - (y - 0.025) ** 2)
     vertices = np.column_stack([x.ravel(), y.ravel(), sphere.ravel()])
@@ -109,7 +109,7 @@ class Moving:
         raise AssertionError("whoever draws waits for nothing")
 
 
-def test_place_part_and_way_are_told_as_planner_and_steps_have_them() -> None:
+def test_place_part_and_way_are_told_as_planner_and_steps_have_them():
     arm, rotation = Kinematics(UR10E_DH), pin.rpy.rpyToMatrix(0.02, -0.01, 0.7)
     situation = Situation(
         arm=None, vehicle=None, laser=None, claw=None, outputs={}, clear=lambda *_: [], postures={}, configuration="",
@@ -135,13 +135,13 @@ def test_place_part_and_way_are_told_as_planner_and_steps_have_them() -> None:
     assert now.as_dict(situation)["path"] is None
 
 
-def test_without_a_job_there_is_neither_part_nor_station() -> None:
+def test_without_a_job_there_is_neither_part_nor_station():
     bare = scene(load_config(None))
     assert bare["station"] is None
     assert "part" not in {body["name"] for body in bare["bodies"]}
 
 
-def test_the_page_asks_nobody_else_and_has_nothing_inline() -> None:
+def test_the_page_asks_nobody_else_and_has_nothing_inline():
     """Its policy is `default-src 'self'`: what is inline would not run, and what is elsewhere would not load."""
     html = (PAGE / "index.html").read_text(encoding="utf-8")
     assert not re.search(r"<script(?![^>]*\bsrc=)|<style|\bstyle=|\bon\w+=", html)
@@ -163,7 +163,7 @@ def mesh_files(folder: Path, *names: str, size: float = 0.1) -> Path:
     return folder
 
 
-def test_links_that_have_a_mesh_are_drawn_by_it_and_the_others_as_the_planner_has_them(tmp_path: Path) -> None:
+def test_links_that_have_a_mesh_are_drawn_by_it_and_the_others_as_the_planner_has_them(tmp_path):
     folder = mesh_files(tmp_path / "meshes", "forearm.stl", "vehicle.ply")
     (folder / "README.txt").write_text("whose they are")
     made = scene(load_config(None), "pot", meshes=folder)
@@ -186,12 +186,12 @@ def test_links_that_have_a_mesh_are_drawn_by_it_and_the_others_as_the_planner_ha
         ((), r"holds no mesh"),
     ],
 )
-def test_a_folder_of_other_meshes_is_refused_by_name(tmp_path: Path, files: tuple[str, ...], said: str) -> None:
+def test_a_folder_of_other_meshes_is_refused_by_name(tmp_path, files: tuple[str, ...], said: str):
     with pytest.raises(ConfigError, match=said):
         link_meshes(mesh_files(tmp_path, *files))
 
 
-def test_a_mesh_in_millimetres_one_that_is_none_and_no_folder_are_refused(tmp_path: Path) -> None:
+def test_a_mesh_in_millimetres_one_that_is_none_and_no_folder_are_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"measures 100 m \(allowed: 0\.005 to 5 m\); export it in metres"):
         link_meshes(mesh_files(tmp_path / "large", "base.stl", size=100.0))
     (tmp_path / "base.stl").write_bytes(b"solid nothing")

@@ -61,7 +61,7 @@ def wall(laser: LaserOptics, now: LightPlane, shift: float = 0.0) -> list[Array]
 
 
 @pytest.mark.parametrize("angle", [0.5e-3, -0.2e-3, 0.0])
-def test_the_turn_is_found_and_its_deviation_is_right(angle: float) -> None:
+def test_the_turn_is_found_and_its_deviation_is_right(angle: float):
     off = []
     for seed in range(6):
         found = pointing(seen(0.0, seed), seen(angle, 100 + seed), CAMERA, PLANE, EXIT)
@@ -72,34 +72,34 @@ def test_the_turn_is_found_and_its_deviation_is_right(angle: float) -> None:
     assert np.sqrt(np.mean(np.square(off))) < 0.025e-3
 
 
-def test_depths_are_right_again_on_the_turned_plane() -> None:
+def test_depths_are_right_again_on_the_turned_plane():
     found = pointing(seen(0.0, 1), seen(0.5e-3, 2), CAMERA, PLANE, EXIT)
     before, after = wall(pointed(0.5e-3), turned(PLANE, EXIT, found.turn))
     assert np.abs(before[:, 2] - WALL).mean() > 0.2e-3
     assert np.abs(after[:, 2] - WALL).mean() < 0.02e-3
 
 
-def test_a_shifted_picture_does_no_harm_to_depths_either() -> None:
+def test_a_shifted_picture_does_no_harm_to_depths_either():
     found = pointing(seen(0.0, 3), seen(0.0, 4, shift=0.3), CAMERA, PLANE, EXIT)
     before, after = wall(LASER, turned(PLANE, EXIT, found.turn), shift=0.3)
     assert np.abs(after[:, 2] - WALL).mean() < 0.2 * np.abs(before[:, 2] - WALL).mean()
 
 
 @pytest.mark.parametrize("turn", [2 * LARGEST_RAD, -2 * LARGEST_RAD])
-def test_a_laser_that_was_knocked_is_refused_with_its_angle(turn: float) -> None:
+def test_a_laser_that_was_knocked_is_refused_with_its_angle(turn: float):
     with pytest.raises(RefusedError, match="laser points") as caught:
         pointing(seen(0.0, 5), seen(turn, 6), CAMERA, PLANE, EXIT)
     assert caught.value.numbers[0].unit == "mrad"
 
 
 @pytest.mark.parametrize("off", [-1e-4, 2e-5, 1.4e-4])
-def test_a_plate_that_was_knocked_is_within_what_is_stated(off: float) -> None:
+def test_a_plate_that_was_knocked_is_within_what_is_stated(off: float):
     found = pointing(seen(0.0, 1), seen(0.0, 2, off=off), CAMERA, PLANE, EXIT)
     # Nothing has turned.
     assert abs(found.turn) < 1.3 * found.sigma
 
 
-def test_looks_from_two_places_of_the_rail_are_not_compared() -> None:
+def test_looks_from_two_places_of_the_rail_are_not_compared():
     before, now = seen(0.0, 1), seen(0.0, 2)
     pointing(before, replace(now, rail=0.04e-3), CAMERA, PLANE, EXIT)
     for rail in (2e-3, -2e-3):
@@ -120,12 +120,12 @@ TURNED = r"line .* is turned by .* mrad.*about its own beam.*cell calibrate"
     ],
     ids=["knocked far off", "covered", "turned", "turned back"],
 )
-def test_a_line_that_says_nothing_of_the_laser_is_refused_with_the_next_step(now: PlateLine, words: str) -> None:
+def test_a_line_that_says_nothing_of_the_laser_is_refused_with_the_next_step(now: PlateLine, words: str):
     with pytest.raises(RefusedError, match=words):
         pointing(seen(0.0, 1), now, CAMERA, PLANE, EXIT)
 
 
-def test_it_is_kept_with_the_calibration() -> None:
+def test_it_is_kept_with_the_calibration():
     witness = seen(0.0, 9)
     again = PlateLine.read(witness.as_dict())
     assert np.array_equal(again.columns, witness.columns, equal_nan=True)
@@ -134,7 +134,7 @@ def test_it_is_kept_with_the_calibration() -> None:
 
 
 @pytest.mark.parametrize("angle", [0.3e-3, -0.5e-3])
-def test_a_laser_that_rolled_about_its_beam_tilts_nothing_any_more(angle: float) -> None:
+def test_a_laser_that_rolled_about_its_beam_tilts_nothing_any_more(angle: float):
     """As the paper draws the sheet, a scan would tilt by more than three times the roll."""
     laser = rolled_laser(angle)
     found = pointing(seen(0.0, 1), seen(0.0, 2, laser=laser), CAMERA, PLANE, EXIT)
@@ -147,7 +147,7 @@ def test_a_laser_that_rolled_about_its_beam_tilts_nothing_any_more(angle: float)
     assert tilts[1] < 0.3e-3
 
 
-def test_a_line_that_has_not_turned_is_silent_and_its_noise_is_stated() -> None:
+def test_a_line_that_has_not_turned_is_silent_and_its_noise_is_stated():
     found = [pointing(seen(0.0, seed), seen(0.0, 100 + seed), CAMERA, PLANE, EXIT) for seed in range(12)]
     assert all(one.roll == 0.0 and one.notes == () for one in found)
     assert all(0.01e-3 < one.roll_sigma < 0.1e-3 for one in found)

@@ -22,7 +22,7 @@ CONFIG = load_config(None)
 Calibrated = tuple[ObservedCell, CellCalibration]
 
 
-def test_what_is_small_is_silent_what_is_more_is_stated_and_the_rest_is_refused() -> None:
+def test_what_is_small_is_silent_what_is_more_is_stated_and_the_rest_is_refused():
     axes = np.eye(3)[[1, 2, 0]]
     small, some, far = (Slip(size, 0.0, 0.0) for size in (0.9 * NOTED_M, 1.5 * NOTED_M, 1.1 * LARGEST_M))
     assert small.notes == () and not small.covariance(axes, 0.015).any()
@@ -65,7 +65,7 @@ def look(cell: ObservedCell, calibration: CellCalibration, rests: int) -> HeadSh
     return HeadShift.of(scan.state(scan.reference.base_from_board), scan.reference, seen)
 
 
-def test_a_head_that_nobody_touched_is_as_uncertain_as_it_is_said(calibrated: Calibrated) -> None:
+def test_a_head_that_nobody_touched_is_as_uncertain_as_it_is_said(calibrated: Calibrated):
     cell, calibration = calibrated
     looks = [look(cell, calibration, 1) for _ in range(40)]
     squares = [one.change @ np.linalg.solve(one.covariance, one.change) for one in looks]
@@ -78,9 +78,7 @@ def test_a_head_that_nobody_touched_is_as_uncertain_as_it_is_said(calibrated: Ca
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_shift_and_a_turn_are_found_and_told_by_how_much(
-    calibrated: Calibrated, axis: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_shift_and_a_turn_are_found_and_told_by_how_much(calibrated: Calibrated, axis: int, monkeypatch):
     cell, calibration = calibrated
     truth, mount = cell.truth, cell.truth.flange_from_scan
     expected = 0.3e-3 * np.eye(3)[axis]
@@ -96,21 +94,19 @@ def test_a_shift_and_a_turn_are_found_and_told_by_how_much(
     assert found.change[3 + axis] == pytest.approx(1e-3, abs=4.0 * np.sqrt(found.covariance[3 + axis, 3 + axis]))
 
 
-def test_a_board_that_was_bent_fits_badly_wherever_the_head_is(
-    calibrated: Calibrated, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_board_that_was_bent_fits_badly_wherever_the_head_is(calibrated: Calibrated, monkeypatch):
     monkeypatch.setattr(calibrated[0], "bend", 0.2e-3)
     found = look(*calibrated, 1)
     assert not found.fits and 3.0 < found.dots < 5.5
 
 
-def test_more_rests_make_it_sharper_down_to_the_calibrations_own_error(calibrated: Calibrated) -> None:
+def test_more_rests_make_it_sharper_down_to_the_calibrations_own_error(calibrated: Calibrated):
     sigma = [np.sqrt(np.diag(look(*calibrated, rests).covariance)) for rests in (1, 2, 8)]
     assert (sigma[1] < 0.85 * sigma[0]).all() and (sigma[2] < 0.85 * sigma[1]).all()
     assert (sigma[2] > 0.25 * sigma[0]).all()
 
 
-def test_what_chance_seldom_brings_is_looked_at_again_and_what_it_never_brings_has_changed() -> None:
+def test_what_chance_seldom_brings_is_looked_at_again_and_what_it_never_brings_has_changed():
     made = HeadShift(np.zeros(6), np.eye(6), dots=1.0, chance=1.0, looks=1)
     assert not made.suspicious and not made.changed
     assert replace(made, chance=0.99 * SUSPICIOUS).suspicious and not replace(made, chance=1.01 * SUSPICIOUS).suspicious
@@ -118,7 +114,7 @@ def test_what_chance_seldom_brings_is_looked_at_again_and_what_it_never_brings_h
     assert replace(made, dots=1.59).fits and not replace(made, dots=1.61).fits
 
 
-def test_changes_are_drawn_about_the_one_that_was_found_and_of_the_mount_alone() -> None:
+def test_changes_are_drawn_about_the_one_that_was_found_and_of_the_mount_alone():
     sigma = np.array([1e-5, 2e-5, 3e-5, 1e-4, 2e-4, 3e-4])
     found = HeadShift(1e-3 * np.arange(1.0, 7.0), np.diag(sigma**2), dots=1.0, chance=1.0, looks=1)
     drawn = found.drawn(4000)

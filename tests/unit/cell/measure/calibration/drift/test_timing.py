@@ -3,7 +3,6 @@
 import time
 from contextlib import nullcontext, suppress
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -83,7 +82,7 @@ def timing(swept: list[TimedSweep]) -> StampTiming:
     return find_timing(calibration(), HERE, swept, MOST_LATE_S, LEAD_M, {})
 
 
-def test_it_is_known_to_a_tenth_of_a_millisecond_and_no_better_than_it_says() -> None:
+def test_it_is_known_to_a_tenth_of_a_millisecond_and_no_better_than_it_says():
     off = []
     for seed in range(10):
         late = np.random.default_rng(100 + seed).uniform(-0.5e-3, 2e-3)
@@ -95,7 +94,7 @@ def test_it_is_known_to_a_tenth_of_a_millisecond_and_no_better_than_it_says() ->
     assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.5
 
 
-def test_clocks_that_are_off_alike_in_all_sweeps_are_stated_though_nothing_scatters() -> None:
+def test_clocks_that_are_off_alike_in_all_sweeps_are_stated_though_nothing_scatters():
     """A link whose shortest round trip is kept: what it left open once, it leaves open in every sweep."""
     found = timing(sweeps(5, 1e-3 + 0.2e-3, jitter=0.0))
     assert found.sigma == pytest.approx(0.25e-3 / np.sqrt(3), rel=0.1)
@@ -112,18 +111,18 @@ def test_clocks_that_are_off_alike_in_all_sweeps_are_stated_though_nothing_scatt
         ({"late": 4.4e-3}, r"come 4\.\d+ ms late, scan_camera\.late allows 2 ms.*scan_camera\.late = \"5 ms\""),
     ],
 )
-def test_what_no_correction_mends_is_refused_by_name(spoilt: dict[str, float], words: str) -> None:
+def test_what_no_correction_mends_is_refused_by_name(spoilt: dict[str, float], words: str):
     with pytest.raises(RefusedError, match=words):
         timing(sweeps(3, **{"late": 0.5e-3, **spoilt}))
 
 
-def test_sweeps_that_hardly_show_the_board_are_refused() -> None:
+def test_sweeps_that_hardly_show_the_board_are_refused():
     few = [replace(one, frames=one.frames[:2]) for one in sweeps(1, 0.0)]
     with pytest.raises(RefusedError, match="2 pictures of the sweep at \\+40 mm/s"):
         timing(few)
 
 
-def test_one_sweep_to_and_fro_tells_a_rolling_shutter() -> None:
+def test_one_sweep_to_and_fro_tells_a_rolling_shutter():
     found = find_shutter(calibration(), HERE, sweeps(3, 1e-3, readout=12e-3)[:2], {})
     assert found.readout == pytest.approx(12e-3, abs=4 * found.sigma)
     assert found.sigma < 0.15e-3
@@ -137,7 +136,7 @@ def test_one_sweep_to_and_fro_tells_a_rolling_shutter() -> None:
 
 
 @pytest.mark.parametrize("late", [0.0, 1.5e-3, -1e-3, 30e-3])
-def test_one_sweep_to_and_fro_tells_roughly_how_late_stamps_come(late: float) -> None:
+def test_one_sweep_to_and_fro_tells_roughly_how_late_stamps_come(late: float):
     found, sigma = roughly_late(calibration(), HERE, sweeps(6, late)[:2])
     assert sigma < 0.5e-3
     assert abs(found - late) < 3 * sigma
@@ -146,7 +145,7 @@ def test_one_sweep_to_and_fro_tells_roughly_how_late_stamps_come(late: float) ->
         refuse_late(found, sigma, MOST_LATE_S)
 
 
-def test_what_is_refused_of_the_times_later_ends_the_stored_calibration_too(tmp_path: Path) -> None:
+def test_what_is_refused_of_the_times_later_ends_the_stored_calibration_too(tmp_path):
     """Else the job after a refused `cell calibrate` would go on with the calibration before it."""
     old = made(2.0)
     save_calibration(old, tmp_path / f"{old.name}.json")
@@ -166,7 +165,7 @@ def test_what_is_refused_of_the_times_later_ends_the_stored_calibration_too(tmp_
     assert found().scan.refused == ""
 
 
-def test_it_is_stored_with_the_calibration() -> None:
+def test_it_is_stored_with_the_calibration():
     head = replace(calibration(), timing=FOUND)
     assert ScanCalibration.from_dict(head.as_dict()).timing == FOUND
     assert "timing" not in calibration().as_dict()
@@ -177,7 +176,7 @@ def test_it_is_stored_with_the_calibration() -> None:
 @pytest.mark.parametrize(
     "spoilt", [{"sigma": 0.0}, {"late": float("nan")}, {"late": "much"}, {"link": None}, {"made": None}]
 )
-def test_kept_lateness_that_cannot_be_read_is_left_out_and_the_calibration_holds(spoilt: dict[str, object]) -> None:
+def test_kept_lateness_that_cannot_be_read_is_left_out_and_the_calibration_holds(spoilt: dict[str, object]):
     head = replace(calibration(), timing=FOUND, shutter=Shutter(1e-5, 2e-5, link_of(CONFIG)))
     stored = head.as_dict()
     read = ScanCalibration.from_dict(stored | {"timing": stored["timing"] | spoilt})
@@ -188,7 +187,7 @@ def test_kept_lateness_that_cannot_be_read_is_left_out_and_the_calibration_holds
     assert "timing cannot be read" in doubt and "scan_camera.late until `cell calibrate timing`" in doubt
 
 
-def test_times_hold_for_the_settings_they_were_measured_with() -> None:
+def test_times_hold_for_the_settings_they_were_measured_with():
     """By the rail's baud rate, that is when its readings come; where a device is does not matter, nor what it sees."""
     faster = CONFIG.model_copy(update={"rail": CONFIG.rail.model_copy(update={"baud": 115200})})
     elsewhere = CONFIG.model_copy(update={"rail": CONFIG.rail.model_copy(update={"url": "/dev/ttyACM7"})})
@@ -207,7 +206,7 @@ def test_times_hold_for_the_settings_they_were_measured_with() -> None:
     assert times_known(calibration(), CONFIG)[1] == (shutter,)
 
 
-def test_a_sweep_puts_late_stamps_back_and_is_surer_of_its_place() -> None:
+def test_a_sweep_puts_late_stamps_back_and_is_surer_of_its_place():
     before = sweep(errors=replace(ERRORS, late=MOST_LATE_S))
     after = sweep(errors=replace(ERRORS, late=MOST_LATE_S, timing=FOUND))
     same = np.isin(before.frame_ids, after.frame_ids)

@@ -21,7 +21,7 @@ def adjusted(archived: Observations, larger: float) -> Joint:
 
 
 @pytest.mark.parametrize("larger", [0.0, 5.5e-3])
-def test_its_size_is_found_and_what_is_noted_is_stated(archived: Observations, larger: float) -> None:
+def test_its_size_is_found_and_what_is_noted_is_stated(archived: Observations, larger: float):
     joint = adjusted(archived, larger)
     assert joint.size.share == pytest.approx(larger, abs=1.5e-3)
     notes = joint.size.notes
@@ -36,7 +36,7 @@ def test_its_size_is_found_and_what_is_noted_is_stated(archived: Observations, l
 
 
 @pytest.mark.parametrize("larger", [0.01, -0.01])
-def test_one_of_another_size_is_refused_with_the_pitch_that_fits(archived: Observations, larger: float) -> None:
+def test_one_of_another_size_is_refused_with_the_pitch_that_fits(archived: Observations, larger: float):
     # Named so, the true pitch of 3 mm is the one that the refusal tells.
     told = r"large board is \d\.\d+ ± .*pitch would be (2\.99|3\.00|3\.01|3)\d* mm"
     with pytest.raises(RefusedError, match=told) as refused:

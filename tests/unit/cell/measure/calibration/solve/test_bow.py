@@ -35,7 +35,7 @@ def solved(off: float, seed: int) -> tuple[HeadWorld, Joint]:
 
 
 @pytest.mark.parametrize(("off", "seed"), [(50e-6, 1), (-20e-6, 2)])
-def test_a_bow_is_known_to_three_micrometres_and_as_stated(off: float, seed: int) -> None:
+def test_a_bow_is_known_to_three_micrometres_and_as_stated(off: float, seed: int):
     _, joint = solved(off, seed)
     bow, plane = joint.adjusted.bow, joint.adjusted.state.plane
     found, sigma = (abs(value) * BESIDE**2 / DEPTH for value in (bow.value, bow.sigma))
@@ -48,12 +48,12 @@ def test_a_bow_is_known_to_three_micrometres_and_as_stated(off: float, seed: int
     assert joint.adjusted.priors.stripe_scale == pytest.approx(1.0, abs=0.1)
 
 
-def test_a_flat_sheet_stays_flat() -> None:
+def test_a_flat_sheet_stays_flat():
     _, joint = solved(0.0, 3)
     assert joint.adjusted.bow is None
 
 
-def test_points_are_measured_on_the_bowed_sheet() -> None:
+def test_points_are_measured_on_the_bowed_sheet():
     world, joint = solved(50e-6, 1)
     calibration = ScanCalibration.of(joint)
     assert "bowed" in calibration.notes[0]
@@ -69,7 +69,7 @@ def test_points_are_measured_on_the_bowed_sheet() -> None:
     assert max(np.ptp(one) for one in off) < 0.06e-3
 
 
-def test_the_bow_is_kept_with_the_calibration_and_varied_by_its_deviation() -> None:
+def test_the_bow_is_kept_with_the_calibration_and_varied_by_its_deviation():
     _, joint = solved(50e-6, 1)
     calibration = ScanCalibration.of(joint)
     again = ScanCalibration.from_dict(calibration.as_dict())
@@ -82,7 +82,7 @@ def test_the_bow_is_kept_with_the_calibration_and_varied_by_its_deviation() -> N
     assert set(bows[:-1]) == {calibration.light_plane.bow}
 
 
-def test_rays_meet_the_bowed_sheet_and_its_derivatives_are_right() -> None:
+def test_rays_meet_the_bowed_sheet_and_its_derivatives_are_right():
     sheet = LightPlane.of((1.0, 0.03, -1 / 3.5), -0.035).bowed(0.02)
     rng = np.random.default_rng(7)
     rays = np.column_stack([rng.uniform(-0.1, 0.1, 40), rng.uniform(-0.15, 0.15, 40), np.ones(40)])
@@ -98,7 +98,7 @@ def test_rays_meet_the_bowed_sheet_and_its_derivatives_are_right() -> None:
     assert (moved - points) / step == pytest.approx(by_distance, rel=1e-4)
 
 
-def test_one_parameter_more_is_what_it_would_be_if_it_were_free() -> None:
+def test_one_parameter_more_is_what_it_would_be_if_it_were_free():
     _, joint = solved(0.0, 3)
     distance, priors = PLANE.stop - 1, joint.adjusted.priors
     held = joint.free.copy()

@@ -13,7 +13,7 @@ from lab.bench.job.whole_job import JobRecord
 from tests.support.report_runs import pot
 
 
-def test_what_is_not_known_of_a_rate_grows_with_the_time(placed_pot: JobRecord) -> None:
+def test_what_is_not_known_of_a_rate_grows_with_the_time(placed_pot: JobRecord):
     made = placed_pot.results
     pose, cloud, times = made["invert_pose"], made["reconstruct"].cloud, made["laser_sweep"].times
     unsure = np.diag([1e-6**2, 0.0, 0.0, 0.0, 0.0, 2e-6**2])
@@ -32,7 +32,7 @@ def test_what_is_not_known_of_a_rate_grows_with_the_time(placed_pot: JobRecord) 
     np.testing.assert_allclose(np.einsum("nim,njm->nij", moved, moved), expected, atol=1e-18)
 
 
-def test_a_cloud_that_crept_is_put_back_to_where_it_was_in_the_middle_of_the_sweep(placed_pot: JobRecord) -> None:
+def test_a_cloud_that_crept_is_put_back_to_where_it_was_in_the_middle_of_the_sweep(placed_pot: JobRecord):
     cloud, times = placed_pot.results["reconstruct"].cloud, placed_pot.results["laser_sweep"].times
     origin, since = cloud.points[cloud.valid].mean(axis=0), float(times.mean())
     creep = Creep(np.array([3e-4, -2e-4, 1e-4, 0.0, 0.0, 2e-3]), np.zeros((6, 6)), origin, since)
@@ -63,7 +63,7 @@ def every_fourth(cloud: Cloud, shift: tuple[float, float, float] = (0.0, 0.0, 0.
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.06e-3, 0.0), (0.05e-3, -0.05e-3, 0.02e-3), (0.0, 0.0, -0.06e-3)])
-def test_a_motion_comes_out_as_it_was_put_in(placed_pot: JobRecord, shift: tuple[float, float, float]) -> None:
+def test_a_motion_comes_out_as_it_was_put_in(placed_pot: JobRecord, shift: tuple[float, float, float]):
     part, cloud = lying(placed_pot)
     found = part.moved(cloud, every_fourth(cloud, shift), KNOWN)
     assert found == pytest.approx(np.linalg.norm(shift), abs=0.01e-3)
@@ -72,9 +72,7 @@ def test_a_motion_comes_out_as_it_was_put_in(placed_pot: JobRecord, shift: tuple
     assert part.moved(cloud, every_fourth(cloud, shift), np.diag([0.1e-3**2] * 6)) == 0.0
 
 
-def test_less_than_matters_is_none_and_what_does_not_show_is_not_known(
-    placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_less_than_matters_is_none_and_what_does_not_show_is_not_known(placed_pot: JobRecord, monkeypatch):
     part, cloud = lying(placed_pot)
     nothing, little = every_fourth(replace(cloud, points=np.full_like(cloud.points, np.nan))), 1e-3
     assert part.moved(cloud, every_fourth(cloud, turn=little), KNOWN) == 0.0

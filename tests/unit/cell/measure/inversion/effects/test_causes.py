@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -111,7 +110,7 @@ def causes(record: JobRecord, cloud: Cloud, pose: pin.SE3) -> list[Cause]:
 
 
 @pytest.mark.parametrize("effect", NAMES)
-def test_the_likeliest_cause_is_the_one_that_was_planted(placed_pot: JobRecord, effect: str) -> None:
+def test_the_likeliest_cause_is_the_one_that_was_planted(placed_pot: JobRecord, effect: str):
     cloud = planted(placed_pot, effect, 1)
     pose, text = inverted(placed_pot, cloud)
     # What is small enough to be placed is in the stated uncertainty; what is refused says why.
@@ -122,14 +121,14 @@ def test_the_likeliest_cause_is_the_one_that_was_planted(placed_pot: JobRecord, 
     assert NAMES[effect][1] in first and "To tell them apart, " in other
 
 
-def test_a_scan_that_fits_has_no_cause(placed_pot: JobRecord) -> None:
+def test_a_scan_that_fits_has_no_cause(placed_pot: JobRecord):
     cloud = placed_pot.results["reconstruct"].cloud
     pose, text = inverted(placed_pot, cloud)
     assert (causes(placed_pot, cloud, pose), text) == ([], "")
 
 
 @pytest.mark.campaign
-def test_causes_over_several_worlds(tmp_path: Path) -> None:
+def test_causes_over_several_worlds(tmp_path):
     """Prints the table of effects and what they were called."""
     right, draws = 0, 4
     table: dict[str, Counter[str]] = {effect: Counter() for effect in NAMES}
@@ -148,7 +147,7 @@ def test_causes_over_several_worlds(tmp_path: Path) -> None:
 
 
 @pytest.mark.campaign
-def test_oil_that_the_world_shows_is_placed_within_what_is_stated_or_named(tmp_path: Path) -> None:
+def test_oil_that_the_world_shows_is_placed_within_what_is_stated_or_named(tmp_path):
     """Prints for each world what became of it."""
     for seed in (1, 2, 3, 4):
         job, nominal = pot()

@@ -62,7 +62,7 @@ def scanned(
                  np.zeros((lines, rows), dtype=bool), flanges)  # fmt: skip
 
 
-def test_each_sweep_rocks_by_itself() -> None:
+def test_each_sweep_rocks_by_itself():
     """A column moves the points of its own sweep alone, as the base turns about the vehicle's axes."""
     cloud, hz = scanned(0.0, 0.0, 1.3), 1.3
     cloud = replace(cloud, sweeps=np.repeat([0, 1], LINES // 2))
@@ -98,7 +98,7 @@ def placed(cloud: Cloud, hz: float | None) -> pin.SE3:
 
 
 @pytest.mark.parametrize(("roll", "pitch", "hz"), [(0.0, 1e-4, 4.0), (7e-5, -7e-5, 2.7), (1e-4, 0.0, 9.3)])
-def test_rocking_is_seen_with_its_frequency_and_the_pose_is_freed_of_it(roll: float, pitch: float, hz: float) -> None:
+def test_rocking_is_seen_with_its_frequency_and_the_pose_is_freed_of_it(roll: float, pitch: float, hz: float):
     cloud = scanned(roll, pitch, hz)
     found = find_rocking(cloud, NOMINAL, placed(cloud, None), TIMES)
     assert found.hz == pytest.approx(hz, abs=0.1)
@@ -110,7 +110,7 @@ def test_rocking_is_seen_with_its_frequency_and_the_pose_is_freed_of_it(roll: fl
     assert np.linalg.norm(after) <= np.linalg.norm(before) + 5e-6
 
 
-def test_a_dense_scan_shows_what_its_lines_show() -> None:
+def test_a_dense_scan_shows_what_its_lines_show():
     """Of so many lines 10,000 points are fewer than 8 each."""
     times = np.arange(1900) / 400.0
     rocks = scanned(0.0, 1e-4, 3.3, times=times, rows=16)
@@ -126,21 +126,21 @@ def test_a_dense_scan_shows_what_its_lines_show() -> None:
     assert droop is not None and droop.sag == pytest.approx(0.3e-3, rel=0.1)
 
 
-def test_a_vehicle_that_stands_is_not_said_to_rock() -> None:
+def test_a_vehicle_that_stands_is_not_said_to_rock():
     for seed in range(2):
         cloud = scanned(0.0, 0.0, 4.0, seed)
         assert find_rocking(cloud, NOMINAL, placed(cloud, None), TIMES) is None
 
 
 @pytest.mark.parametrize("slower", [1, 4])
-def test_a_sweep_repeated_more_slowly_shows_the_same_frequency(slower: int) -> None:
+def test_a_sweep_repeated_more_slowly_shows_the_same_frequency(slower: int):
     times = 512.0 + slower * TIMES
     found = find_rocking(scanned(0.0, 1e-4, 2.6, times=times), NOMINAL, SURFACE, times)
     assert found is not None and found.hz == pytest.approx(2.6, abs=0.1)
 
 
 @pytest.mark.parametrize("pause", [0.0, 5.13, -LINES / RATE])
-def test_several_sweeps_have_a_phase_each(pause: float) -> None:
+def test_several_sweeps_have_a_phase_each(pause: float):
     later = TIMES + LINES / RATE + pause
     # With -LINES / RATE the clock begins anew.
     clouds = [scanned(0.0, 1e-4, 4.0, 0), scanned(0.0, 1e-4, 4.0, 1, later + 0.125)]
@@ -148,7 +148,7 @@ def test_several_sweeps_have_a_phase_each(pause: float) -> None:
     assert found is not None and found.hz == pytest.approx(4.0, abs=0.1)
 
 
-def test_sweeps_that_lie_on_each_other_by_a_step_do_not_rock() -> None:
+def test_sweeps_that_lie_on_each_other_by_a_step_do_not_rock():
     clouds = [scanned(0.0, 0.0, 4.0, seed) for seed in range(3)]
     clouds[1].points[:, :, 2] += 6e-5
     times = np.concatenate([TIMES + 5.0 * k for k in range(3)])
@@ -158,27 +158,27 @@ def test_sweeps_that_lie_on_each_other_by_a_step_do_not_rock() -> None:
 @pytest.mark.parametrize(
     ("kept", "times"), [(0, TIMES), (20, TIMES), (LINES, np.zeros(LINES))], ids=["none", "few", "no times"]
 )
-def test_few_lines_and_times_that_tell_none_apart_tell_of_no_rocking(kept: int, times: np.ndarray) -> None:
+def test_few_lines_and_times_that_tell_none_apart_tell_of_no_rocking(kept: int, times: np.ndarray):
     cloud = scanned(0.0, 1e-4, 4.0)
     cloud.points[kept:] = np.nan
     assert find_rocking(cloud, NOMINAL, SURFACE, times) is None
 
 
 @pytest.mark.parametrize("times", [2, 3])
-def test_an_overtone_is_told_by_its_size(times: int) -> None:
+def test_an_overtone_is_told_by_its_size(times: int):
     heights = 1e-5 * (np.sin(2 * np.pi * 2.0 * TIMES) + 0.4 * np.sin(2 * np.pi * 2.0 * times * TIMES + 0.3))
     sweep = _Sweep.of(TIMES, heights, np.outer(TIMES, [0.015, 0.0, 0.0]))
     assert sweep is not None and sweep.overtones(2.0) == pytest.approx(0.4, abs=0.02)
 
 
-def test_what_is_stated_for_the_moment_of_placing_is_the_mean_square() -> None:
+def test_what_is_stated_for_the_moment_of_placing_is_the_mean_square():
     covariance = rocking_covariance(Rocking(4.0, 1e-4, 3.75e-3), VEHICLE, SURFACE.translation)
     beside = float(np.linalg.norm((SURFACE.translation - VEHICLE.translation)[:2]))
     assert covariance[3, 3] == pytest.approx(0.5 * (1e-4 / beside) ** 2)
     assert covariance[2, 2] == pytest.approx(0.5 * 1e-4**2)
 
 
-def test_a_roll_that_photographs_show_shifts_the_place_to_the_side_where_the_scan_shows_less() -> None:
+def test_a_roll_that_photographs_show_shifts_the_place_to_the_side_where_the_scan_shows_less():
     arm = SURFACE.translation - VEHICLE.translation
     alone = rocking_covariance(None, VEHICLE, SURFACE.translation, 2e-4)
     way = np.array([*np.cross([1.0, 0.0, 0.0], arm), 1.0, 0.0, 0.0])
@@ -189,23 +189,23 @@ def test_a_roll_that_photographs_show_shifts_the_place_to_the_side_where_the_sca
     assert (both[3, 3], both[4, 4]) == pytest.approx((0.5 * 2e-4**2, pitch))
 
 
-def test_a_board_that_a_roll_does_not_move_tells_of_a_roll_that_is_refused() -> None:
+def test_a_board_that_a_roll_does_not_move_tells_of_a_roll_that_is_refused():
     beside = pin.SE3(np.eye(3), VEHICLE.translation + np.array([1.0, 0.0, 0.0]))
     assert roll_of(0.0, beside, VEHICLE) == 0.0
     assert roll_of(20e-6, beside, VEHICLE) > LARGEST_RAD
 
 
-def test_a_vehicle_that_rocks_too_much_is_waited_for() -> None:
+def test_a_vehicle_that_rocks_too_much_is_waited_for():
     with pytest.raises(RefusedError, match=r"rocks.*Wait until it is quiet"):
         rocking_covariance(Rocking(3.0, 4 * LARGEST_RAD, 5e-3), VEHICLE, SURFACE.translation)
 
 
-def test_a_refused_scan_stays_refused_and_both_readings_are_told() -> None:
+def test_a_refused_scan_stays_refused_and_both_readings_are_told():
     with pytest.raises(RefusedError, match=r"off the nominal.*the vehicle rocks at .* Hz.*waves of [\d.]+ mm"):
         inverted(worn(300e-6, 8e-3, seed=1))
 
 
-def test_lands_and_ridges_are_not_taken_for_rocking() -> None:
+def test_lands_and_ridges_are_not_taken_for_rocking():
     for seed, length in enumerate((6e-3, 9.5e-3)):
         cloud = worn(350e-6, length, sharp=True, seed=seed)
         assert find_rocking(cloud, NOMINAL, SURFACE, TIMES) is None
@@ -213,7 +213,7 @@ def test_lands_and_ridges_are_not_taken_for_rocking() -> None:
         inverted(cloud)
 
 
-def test_where_it_is_accepted_the_note_names_the_waves_that_look_the_same() -> None:
+def test_where_it_is_accepted_the_note_names_the_waves_that_look_the_same():
     (note,) = inverted(scanned(0.0, 3e-5, 4.0)).notes
     pace = 0.93 * np.ptp(NOMINAL.extent, axis=0)[0] / (LINES - 1) * RATE
     told = re.search(r"rocks, or the surface has waves of ([\d.]+) mm", note)

@@ -45,7 +45,7 @@ def rail(at: float, name: str, **arguments: float) -> tuple[str, float, dict[str
     return "/rail/command", at, {"name": name, "arguments": arguments, "refused": ""}
 
 
-def test_an_arm_moves_from_its_last_state_at_rest_to_its_last_in_motion(tmp_path: Path) -> None:
+def test_an_arm_moves_from_its_last_state_at_rest_to_its_last_in_motion(tmp_path):
     # What a motion recorded by itself may come after what is told later.
     found = recorded(tmp_path, arm(1.0, 0.0), arm(2.0, 0.5), arm(4.0, 0.0), arm(3.0, -0.5), arm(9.0, 0.0))
     (moved,) = found
@@ -55,7 +55,7 @@ def test_an_arm_moves_from_its_last_state_at_rest_to_its_last_in_motion(tmp_path
     assert moved.words == "arm moves, 2.00 s"
 
 
-def test_a_rail_is_on_its_way_until_it_must_be_there_or_tells_more(tmp_path: Path) -> None:
+def test_a_rail_is_on_its_way_until_it_must_be_there_or_tells_more(tmp_path):
     found = recorded(
         tmp_path, rail(1.0, "move_to", position=0.02), rail(5.0, "sweep", start=0.02, stop=0.08, speed=0.015),
         ("/rail/state", 9.2, {"position": 0.08, "homed": True}), rail(10.0, "move_to", position=0.0),
@@ -65,7 +65,7 @@ def test_a_rail_is_on_its_way_until_it_must_be_there_or_tells_more(tmp_path: Pat
     assert ends == pytest.approx([1.0 + 0.02 / RAIL_M_S + 0.02, 9.2, 10.0 + 0.08 / RAIL_M_S + SWITCH_S])
 
 
-def test_a_laser_is_lit_until_it_is_off_and_pictures_close_together_are_one_look(tmp_path: Path) -> None:
+def test_a_laser_is_lit_until_it_is_off_and_pictures_close_together_are_one_look(tmp_path):
     def laser(at: float, name: str) -> tuple[str, float, dict[str, object]]:
         return "/laser/command", at, {"name": name, "arguments": {}, "refused": ""}
 
@@ -76,7 +76,7 @@ def test_a_laser_is_lit_until_it_is_off_and_pictures_close_together_are_one_look
     assert idle(found, 6.0) == [(0.0, pytest.approx(1.0)), (3.0, pytest.approx(5.0)), (pytest.approx(5.02), 6.0)]
 
 
-def test_what_was_refused_is_not_drawn_and_a_laser_that_nobody_put_out_is(tmp_path: Path) -> None:
+def test_what_was_refused_is_not_drawn_and_a_laser_that_nobody_put_out_is(tmp_path):
     lit = {"name": "lit", "arguments": {}}
     refused = "/laser/command", 1.0, {**lit, "refused": "the vehicle drives"}
     found = recorded(
@@ -85,7 +85,7 @@ def test_what_was_refused_is_not_drawn_and_a_laser_that_nobody_put_out_is(tmp_pa
     assert [(one.device, one.begin, one.end) for one in found] == [("laser", pytest.approx(4.0), pytest.approx(6.5))]
 
 
-def test_of_a_whole_job_the_arm_and_the_vehicle_never_move_at_once(placed_pot: JobRecord) -> None:
+def test_of_a_whole_job_the_arm_and_the_vehicle_never_move_at_once(placed_pot: JobRecord):
     found = activities(placed_pot.folder)
     moves = {name: [one for one in found if one.device == name] for name in ("arm", "vehicle", "rail", "laser")}
     assert all(moves.values())
@@ -96,13 +96,13 @@ def test_of_a_whole_job_the_arm_and_the_vehicle_never_move_at_once(placed_pot: J
     assert sum(end - begin for begin, end in idle(found, length)) < 0.15 * length
 
 
-def test_without_a_record_there_are_none(tmp_path: Path) -> None:
+def test_without_a_record_there_are_none(tmp_path):
     assert activities(tmp_path) == []
     (tmp_path / "record.mcap").write_bytes(b"no record")
     assert activities(tmp_path) == []
 
 
-def test_steps_follow_each_other_in_the_cells_time_on_the_virtual_clock(tmp_path: Path) -> None:
+def test_steps_follow_each_other_in_the_cells_time_on_the_virtual_clock(tmp_path):
     journal = Journal(tmp_path, "run", {"clock": "virtual"})
     for attempt, error in ((1, "frames were lost"), (2, None)):
         journal.step_ended(journal.step_started("laser_sweep", attempt), 2.0 * attempt, {}, error)
@@ -113,7 +113,7 @@ def test_steps_follow_each_other_in_the_cells_time_on_the_virtual_clock(tmp_path
     assert [mark.at for mark in course.marks] == [2.0]
 
 
-def test_steps_and_faults_stand_where_the_wall_had_them(tmp_path: Path) -> None:
+def test_steps_and_faults_stand_where_the_wall_had_them(tmp_path):
     journal = Journal(tmp_path, "run", {})
     key = journal.step_started("laser_sweep", 1)
     journal.event("confirm_needed", "laser_sweep", {"number": 1, "reason": "look at the arm"})
@@ -128,7 +128,7 @@ def test_steps_and_faults_stand_where_the_wall_had_them(tmp_path: Path) -> None:
     assert all(0.0 <= mark.at <= course.length < 60.0 for mark in course.marks)
 
 
-def test_the_trend_holds_the_runs_of_the_job_before_this_one(tmp_path: Path) -> None:
+def test_the_trend_holds_the_runs_of_the_job_before_this_one(tmp_path):
     def run(name: str, **facts: Any) -> Path:
         (tmp_path / name).mkdir()
         write_json(tmp_path / name / "report.json", {"outcome": "placed", "kind": "job", "job": "pot", **facts})
@@ -146,13 +146,13 @@ def test_the_trend_holds_the_runs_of_the_job_before_this_one(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(("length", "ticks"), [(0.1, 2), (1.0, 11), (47.0, 10), (80_000.0, 9)])
-def test_an_axis_has_few_ticks_at_round_places_and_ends_within_the_drawing(length: float, ticks: int) -> None:
+def test_an_axis_has_few_ticks_at_round_places_and_ends_within_the_drawing(length: float, ticks: int):
     drawn = Timeline((), (), length, "on the wall").ticks
     assert len(drawn) == ticks
     assert drawn[0] == 0.0 and drawn[-1] <= length
 
 
-def test_the_axis_of_the_trend_holds_every_value() -> None:
+def test_the_axis_of_the_trend_holds_every_value():
     past = Past("a", "", "placed", simulated=True, true_mm=0.9, stated_mm=None)
     assert Trend([past], 0.6).highest == pytest.approx(0.99)
     assert Trend([past], 2.0).ticks == pytest.approx([0.0, 0.5, 1.0, 1.5, 2.0])

@@ -55,7 +55,7 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def folder(placed_pot: JobRecord, ends: Ends, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(placed_pot: JobRecord, ends: Ends, tmp_path_factory) -> Path:
     """A placed run with what a whole run leaves: cloud, job and journal."""
     folder = tmp_path_factory.mktemp("page") / ends(report_runs.placed).folder.name
     shutil.copytree(ends(report_runs.placed).folder, folder)
@@ -69,7 +69,7 @@ def folder(placed_pot: JobRecord, ends: Ends, tmp_path_factory: pytest.TempPathF
     return folder
 
 
-def test_the_page_of_a_placed_run(folder: Path) -> None:
+def test_the_page_of_a_placed_run(folder: Path):
     text = make_page(folder)
     page = Page(text)
     report = json.loads((folder / "report.json").read_text())
@@ -88,7 +88,7 @@ def test_the_page_of_a_placed_run(folder: Path) -> None:
     assert f"{data['count']} of {data['total']} measured points are shown" in page.text
 
 
-def test_a_report_is_not_believed_to_be_harmless(folder: Path, tmp_path: Path) -> None:
+def test_a_report_is_not_believed_to_be_harmless(folder: Path, tmp_path):
     hostile = "</script><script>alert(1)</script><img src=http://elsewhere/x>"
     run = tmp_path / folder.name
     run.mkdir()
@@ -105,7 +105,7 @@ def test_a_report_is_not_believed_to_be_harmless(folder: Path, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("make", [report_runs.too_strict, report_runs.no_board, report_runs.faulted])
-def test_a_run_that_did_not_place_says_why_with_its_numbers(ends: Ends, make: report_runs.Make) -> None:
+def test_a_run_that_did_not_place_says_why_with_its_numbers(ends: Ends, make: report_runs.Make):
     ended: Ended = ends(make)
     text = make_page(ended.folder)
     page = Page(text)
@@ -116,7 +116,7 @@ def test_a_run_that_did_not_place_says_why_with_its_numbers(ends: Ends, make: re
     assert "data:image/jpeg;base64," in text
 
 
-def test_what_cannot_be_read_of_a_run_is_said_on_its_page(folder: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_read_of_a_run_is_said_on_its_page(folder: Path, tmp_path):
     run = tmp_path / folder.name
     shutil.copytree(folder, run)
     report = json.loads((folder / "report.json").read_text())
@@ -130,7 +130,7 @@ def test_what_cannot_be_read_of_a_run_is_said_on_its_page(folder: Path, tmp_path
         make_page(run)
 
 
-def test_the_command_writes_it_beside_the_run_or_where_it_is_asked_to(tmp_path: Path) -> None:
+def test_the_command_writes_it_beside_the_run_or_where_it_is_asked_to(tmp_path):
     run = tmp_path / "20260101T000000-0001"
     run.mkdir()
     Journal(run, run.name, {"kind": "home"}).close()
@@ -158,15 +158,13 @@ OUTSIDE = {"name": "first touch", "value": 2.0, "unit": "mm", "limit": 1.0, "bou
         ({"outcome": "done", "measured": [OUTSIDE, OUTSIDE]}, "2 figures outside their limits", False),
     ],
 )
-def test_a_verdict_is_good_only_where_every_figure_keeps_its_limit(
-    report: dict[str, Any], words: str, good: bool
-) -> None:
+def test_a_verdict_is_good_only_where_every_figure_keeps_its_limit(report: dict[str, Any], words: str, good: bool):
     told = verdict(report)
     assert (told.words, told.good) == (words, good)
     assert [row.kept for row in judged(report)] == [False] * len(report.get("measured", ()))
 
 
-def test_what_was_not_measured_is_not_called_an_actual_value() -> None:
+def test_what_was_not_measured_is_not_called_an_actual_value():
     rows = {row.cells[0]: row.cells for row in compared({**TOLERANCE, **BOUND, "measured": [OUTSIDE]})}
     assert rows["part's points, largest D"][1:] == ("0 mm", "not measured", "", "at most 0.6 mm", "0.250 mm")
     assert rows["part's points, largest along z"][4:] == ("", "0.200 mm")
@@ -175,7 +173,7 @@ def test_what_was_not_measured_is_not_called_an_actual_value() -> None:
 @pytest.mark.parametrize(
     ("seconds", "age"), [(30, "30 s"), (150, "2 min"), (9000, "2 h"), (200_000, "2 days"), (None, "made 2026-01-01")]
 )
-def test_a_calibration_is_told_with_its_age(tmp_path: Path, seconds: float | None, age: str) -> None:
+def test_a_calibration_is_told_with_its_age(tmp_path, seconds: float | None, age: str):
     began = 1_790_000_000.0
     write_json(tmp_path / "calibration.json", {} if seconds is None else {"made": began - seconds})
     report = {"started": "2026-09-21T14:13:20+00:00", "calibration_hash": "abc", "calibration_date": "2026-01-01"}
@@ -183,7 +181,7 @@ def test_a_calibration_is_told_with_its_age(tmp_path: Path, seconds: float | Non
     assert told.startswith("hash abc, made 2026-01-01") and age in told
 
 
-def test_where_nobody_knows_the_truth_the_part_is_where_it_was_seen() -> None:
+def test_where_nobody_knows_the_truth_the_part_is_where_it_was_seen():
     seen = {"off_mm": 0.08, "shift_mm": [0.05, -0.06, 0.01]}
     for more in ({"steps": [{"name": "verify", "result": seen}]}, {"refusal": {"placed": seen}}):
         rows = {row.cells[0]: row.cells for row in compared({**TOLERANCE, **BOUND, **more})}

@@ -11,7 +11,7 @@ POINTS = np.random.default_rng(0).uniform([-35.0, -18.0, 2.0], [35.0, 18.0, 8.0]
 
 
 @pytest.mark.parametrize("compared", [True, False])
-def test_a_cloud_keeps_its_size_and_its_scale_ends_where_it_is_said(compared: bool) -> None:
+def test_a_cloud_keeps_its_size_and_its_scale_ends_where_it_is_said(compared: bool):
     scan = Scanned(POINTS, 0.01 * POINTS[:, 0] if compared else None, "")
     view = view_data(scan, 0.2)
     assert (view["count"], view["total"]) == (MOST_POINTS, len(POINTS))

@@ -14,7 +14,7 @@ from tests.support.wire.arm_bench import ArmBench
 pytestmark = pytest.mark.wire
 
 
-def test_the_world_runs_as_many_times_faster_as_asked_at_an_unchanged_packet_rate(arm: Client) -> None:
+def test_the_world_runs_as_many_times_faster_as_asked_at_an_unchanged_packet_rate(arm: Client):
     wall, world = CLOCK.now(), arm.receive.getTimestamp()
     started = arm.receive.getTimestamp()
     assert arm.control.moveJ((HOME + 0.5).tolist(), 0.5, 2.0)
@@ -24,7 +24,7 @@ def test_the_world_runs_as_many_times_faster_as_asked_at_an_unchanged_packet_rat
     assert (arm.receive.getTimestamp() - world) / (CLOCK.now() - wall) == pytest.approx(SPEED, rel=0.03)
 
 
-def test_clients_that_vanish_send_garbage_or_never_read_leave_the_others_alone(arm: Client) -> None:
+def test_clients_that_vanish_send_garbage_or_never_read_leave_the_others_alone(arm: Client):
     address = arm.simulator.address
     for port in (30004, 29999, 30003):
         for junk in (b"", b"\0", b"\0\0\0\0", b"\xff" * 70000, b"GET / HTTP/1.1\r\n\r\n", bytes(range(256))):
@@ -41,7 +41,7 @@ def test_clients_that_vanish_send_garbage_or_never_read_leave_the_others_alone(a
     deaf.socket.close()
 
 
-def test_two_arms_run_side_by_side_and_a_client_can_leave_and_come_back(arm: Client) -> None:
+def test_two_arms_run_side_by_side_and_a_client_can_leave_and_come_back(arm: Client):
     with ArmBench() as other:
         assert other.address != arm.simulator.address and other.address.startswith("127.0.")
         for offset in (0.1, 0.2):
@@ -53,7 +53,7 @@ def test_two_arms_run_side_by_side_and_a_client_can_leave_and_come_back(arm: Cli
         np.testing.assert_allclose(arm.q(), HOME, atol=1e-9)
 
 
-def test_inputs_of_ur_rtde_are_in_use_and_packets_are_padded_or_cut(arm: Client) -> None:
+def test_inputs_of_ur_rtde_are_in_use_and_packets_are_padded_or_cut(arm: Client):
     client = Rtde(arm.simulator.address)
     assert struct.unpack(">4I", client.ask("v"))[:2] == (5, 15)
     reply = client.ask("I", b"input_int_register_47,standard_digital_output_mask")

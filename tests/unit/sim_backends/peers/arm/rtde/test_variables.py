@@ -41,7 +41,7 @@ SIZES = {
 }  # fmt: skip
 
 
-def test_every_documented_output_is_sent_with_its_type(address: str) -> None:
+def test_every_documented_output_is_sent_with_its_type(address: str):
     assert len(NAMES) == 393
     client = Rtde(address)
     reply = client.ask("O", struct.pack(">d", 500.0) + ",".join(NAMES).encode())
@@ -55,7 +55,7 @@ def test_every_documented_output_is_sent_with_its_type(address: str) -> None:
     assert len(state) == 1 + sum(SIZES[kind] for kind in kinds)
 
 
-def test_an_unknown_name_is_not_found_and_an_input_that_another_writes_is_in_use_until_it_leaves(address: str) -> None:
+def test_an_unknown_name_is_not_found_and_an_input_that_another_writes_is_in_use_until_it_leaves(address: str):
     first, second = Rtde(address), Rtde(address)
     assert first.ask("O", struct.pack(">d", 125.0) + b"timestamp,joint_gossip") == b"\0DOUBLE,NOT_FOUND"
     assert first.ask("I", b"input_bit_register_64,input_bit_registers0_to_31") == b"\1BOOL,UINT32"
@@ -67,7 +67,7 @@ def test_an_unknown_name_is_not_found_and_an_input_that_another_writes_is_in_use
     raise AssertionError("the input was not given back")
 
 
-def test_inputs_of_every_kind_come_back_as_outputs(address: str) -> None:
+def test_inputs_of_every_kind_come_back_as_outputs(address: str):
     client = Rtde(address)
     names = "input_bit_registers0_to_31,input_bit_register_70,input_int_register_40,input_double_register_41"
     assert client.ask("I", names.encode()) == b"\1UINT32,BOOL,INT32,DOUBLE"
@@ -77,7 +77,7 @@ def test_inputs_of_every_kind_come_back_as_outputs(address: str) -> None:
     assert struct.unpack(">BI?id", client.states(4)[-1]) == (1, 0x80000005, True, -7, 2.5)
 
 
-def test_receivers_have_rates_of_their_own_and_version_1_has_no_recipe_numbers(address: str) -> None:
+def test_receivers_have_rates_of_their_own_and_version_1_has_no_recipe_numbers(address: str):
     fast, slow, old = Rtde(address), Rtde(address), Rtde(address, version=1)
     fast.ask("O", struct.pack(">d", 500.0) + b"timestamp")
     slow.ask("O", struct.pack(">d", 25.0) + b"timestamp,actual_q")

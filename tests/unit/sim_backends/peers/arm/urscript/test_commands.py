@@ -10,7 +10,7 @@ from sim_backends.peers.arm.program import RuntimeState
 from tests.support.simulator.script_controller import Controller, program
 
 
-def test_moves_arrive_in_the_time_they_are_given(controller: Controller) -> None:
+def test_moves_arrive_in_the_time_they_are_given(controller: Controller):
     goal = [0.3, -1.5, -1.6, -1.5, 1.5, 0.1]
     controller.program.load(program(f"movej({goal}, t=1.0)", "write_output_integer_register(0, 1)"))
     controller.cycles(495)
@@ -25,7 +25,7 @@ def test_moves_arrive_in_the_time_they_are_given(controller: Controller) -> None
 
 
 @pytest.mark.parametrize("mode", [0, 1])
-def test_a_circle_goes_past_its_via_point_and_on_after_a_pause(controller: Controller, mode: int) -> None:
+def test_a_circle_goes_past_its_via_point_and_on_after_a_pause(controller: Controller, mode: int):
     """Three quarters of a circle of 50 mm round a centre below the tool, in a plane that leans."""
     model = controller.model
     start = model.drive.base_from_tcp()
@@ -59,7 +59,7 @@ def test_a_circle_goes_past_its_via_point_and_on_after_a_pause(controller: Contr
     assert turned == pytest.approx(quarter if mode else 0.0, abs=2e-2 if mode else 1e-6)
 
 
-def test_a_speed_that_nobody_repeats_and_a_killed_thread_come_to_rest(controller: Controller) -> None:
+def test_a_speed_that_nobody_repeats_and_a_killed_thread_come_to_rest(controller: Controller):
     controller.program.load(program("speedj([0.2, 0, 0, 0, 0, 0], 2.0, 0.3)", "sleep(1)"))
     controller.cycles(150)
     assert controller.model.drive.qd[0] == pytest.approx(0.2)
@@ -75,7 +75,7 @@ def test_a_speed_that_nobody_repeats_and_a_killed_thread_come_to_rest(controller
     assert not controller.model.moving
 
 
-def test_two_threads_cannot_move_the_arm_at_once(controller: Controller) -> None:
+def test_two_threads_cannot_move_the_arm_at_once(controller: Controller):
     controller.run(
         "def program():\n  thread go():\n    movej([1, -1.57, -1.57, -1.57, 1.57, 0])\n  end\n"
         "  mover = run go()\n  sync()\n  sync()\n  movej([0, -1.57, -1.57, -1.57, 1.57, 0])\nend\n"
@@ -86,7 +86,7 @@ def test_two_threads_cannot_move_the_arm_at_once(controller: Controller) -> None
 @pytest.mark.parametrize(("action", "state"), [("PAUSE", RuntimeState.PAUSED), ("STOP", RuntimeState.STOPPED)])
 def test_a_watched_input_that_is_not_written_to_pauses_or_stops(
     controller: Controller, action: str, state: RuntimeState
-) -> None:
+):
     name = "input_int_register_0"
     controller.program.load(program(f'rtde_set_watchdog("{name}", 10, "{action}")', "while True:", "  sync()", "end"))
     for _ in range(5):

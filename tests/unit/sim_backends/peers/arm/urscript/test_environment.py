@@ -33,6 +33,6 @@ from tests.support.simulator.script_controller import Controller, program
         ("binary_list_to_integer(integer_to_binary_list(-5))", "-5"),
     ],
 )  # fmt: skip
-def test_expressions_have_the_values_of_arithmetic(controller: Controller, expression: str, value: str) -> None:
+def test_expressions_have_the_values_of_arithmetic(controller: Controller, expression: str, value: str):
     controller.run(program(f"textmsg({expression})"))
     assert controller.said() == [value]

@@ -6,7 +6,7 @@ from sim_backends.peers.arm.program import RuntimeState
 from tests.support.simulator.script_controller import Controller, program
 
 
-def test_threads_share_globals_take_turns_and_are_joined_and_killed(controller: Controller) -> None:
+def test_threads_share_globals_take_turns_and_are_joined_and_killed(controller: Controller):
     controller.program.load(
         """def program():
   global count = 0
@@ -50,13 +50,13 @@ end"""
         ("movej([-123, 0, 0, 0, 0, 0])", "joint 0 to -123 rad"),
     ],
 )
-def test_a_run_time_error_ends_the_program_and_says_why(controller: Controller, line: str, reason: str) -> None:
+def test_a_run_time_error_ends_the_program_and_says_why(controller: Controller, line: str, reason: str):
     controller.run(program(line, 'textmsg("went on")'))
     assert controller.said() == []
     assert reason in controller.failed()[0]
 
 
-def test_a_script_reaches_nothing_of_the_host(controller: Controller) -> None:
+def test_a_script_reaches_nothing_of_the_host(controller: Controller):
     for line in ("x = __import__", "open(1)", "exec(1)", "x = [1].__class__", "eval(1)"):
         controller.run(program(line))
     assert len(controller.failed()) == 5
@@ -83,7 +83,7 @@ SQUARES = "def program():\n def f(n):\n  return f(n*n)\n end\n f(9)\nend\n"
 )
 def test_a_script_that_would_never_give_way_ends_and_the_controller_goes_on(
     controller: Controller, text: str, reason: str
-) -> None:
+):
     controller.run(text, 60)
     assert reason in controller.failed()[-1]
     controller.run(program("sync()"))

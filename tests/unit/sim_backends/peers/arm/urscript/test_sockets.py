@@ -6,7 +6,7 @@ from sim_backends.peers.arm.program import RuntimeState
 from tests.support.simulator.script_controller import Controller, program
 
 
-def test_a_script_talks_with_a_server_and_only_on_loopback(controller: Controller) -> None:
+def test_a_script_talks_with_a_server_and_only_on_loopback(controller: Controller):
     server = socket.create_server(("127.0.0.1", 0))
     port = server.getsockname()[1]
     controller.program.load(

@@ -7,7 +7,7 @@ from sim_backends.peers.arm.urscript.translate import ScriptCollector
 from tests.support.simulator.script_controller import Controller, program
 
 
-def test_functions_loops_branches_and_scopes(controller: Controller) -> None:
+def test_functions_loops_branches_and_scopes(controller: Controller):
     controller.run(
         """def program():
   global total = 0
@@ -68,7 +68,7 @@ end"""
 )
 def test_a_text_that_does_not_compile_changes_nothing_and_clients_hear_what_a_controller_says(
     controller: Controller, line: str, reason: str, told: tuple[int, int, str]
-) -> None:
+):
     """The words and places are those that controllers and URSim were recorded with."""
     controller.program.load(program("while True:", "  sync()", "end"))
     controller.cycles(2)
@@ -79,7 +79,7 @@ def test_a_text_that_does_not_compile_changes_nothing_and_clients_hear_what_a_co
     assert f"line {failed.line}" in controller.program.message and reason in controller.program.message
 
 
-def test_texts_are_taken_whole_however_they_arrive() -> None:
+def test_texts_are_taken_whole_however_they_arrive():
     text = "def a():\n  def b():\n  if True:\n sync()\nend\nend\nb()\nend\n"
     collector = ScriptCollector()
     whole = [one for byte in (text + "movej([0])\n").encode() for one in collector.feed(bytes([byte]))]
@@ -102,5 +102,5 @@ SAME_NAME_TWICE = "def program():\n  def f(a, a):\n  end\nend\n"
         program("3 = 3"),
     ],
 )
-def test_a_text_that_python_does_not_compile_is_a_compile_error(controller: Controller, text: str) -> None:
+def test_a_text_that_python_does_not_compile_is_a_compile_error(controller: Controller, text: str):
     assert not controller.program.load(text) and controller.failed()
