@@ -214,7 +214,6 @@ class ArmSession:
             self._require_safe_without(error)
 
     def recover(self, confirmed: bool) -> None:
-        """See `UrArm.recover`."""
         self.require_control()
         with self._counting:
             stops = self._stops

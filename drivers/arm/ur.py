@@ -244,7 +244,6 @@ class UrArm:
 
     @contextmanager
     def trying(self, index: int) -> Iterator[None]:
-        """See `drivers.interfaces.TriesOutputs`."""
         with self._session.trying(_check_output(self.name, index)):
             yield
 

@@ -30,7 +30,6 @@ class RobotiqClawConfig(ClawConfig):
     inside: bool = False
 
     def wire(self) -> dict[str, object]:
-        """See `DeviceConfig`."""
         return {"make": self.driver, "place": self.address}
 
 

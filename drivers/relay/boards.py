@@ -377,7 +377,6 @@ def open_board(name: str, kind: str, make: str, url: str, *, baud: int) -> Numat
 
 
 def open_numato(name: str, kind: str, url: str, *, baud: int) -> NumatoBoard:
-    """See `open_board`."""
     board = NumatoBoard(RelayPort(name, kind, url, baud=baud))
     try:
         board.ping()
@@ -403,7 +402,6 @@ class _OnBoard:
         return Identity(who.model, who.serial, who.firmware, f"{who.address} relay {self._relay}")
 
     def ping(self) -> float:
-        """See `RelayWiring.ping`."""
         return self._board.ping()
 
 

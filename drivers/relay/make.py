@@ -39,7 +39,6 @@ class OnBoard(DeviceConfig):
         return real_path(self.url)
 
     def wire(self) -> dict[str, object]:
-        """See `DeviceConfig`."""
         return {"make": self.driver, "place": self.held, "relay": self.relay}
 
 
@@ -82,7 +81,6 @@ class NumatoClawConfig(OnBoard, ClawConfig):
     baud: Annotated[int, whole(9600, 921600, allowed=NUMATO_BAUDS)] = 19200
 
     def wire(self) -> dict[str, object]:
-        """See `DeviceConfig`."""
         return super().wire() | {"feedback": self.feedback, "active_high": self.held_is == "high"}
 
 

@@ -65,7 +65,6 @@ class FixedVehicleConfig(VehicleConfig):
     lean_sigma: Annotated[float, quantity("mrad/m", 0, 20)] = 0.0
 
     def wire(self) -> dict[str, object]:
-        """See `DeviceConfig`."""
         return {"make": self.driver}
 
 

@@ -190,16 +190,13 @@ class ModbusRailConfig(RailConfig):
 
     @property
     def counted(self) -> tuple[int, int]:
-        """See `RailConfig`."""
         return self.counts_per_turn, 1
 
     @property
     def untold_serial(self) -> str | None:
-        """See `RailConfig`."""
         return (self.serial or UNTOLD) if self.registers.serial is None else None
 
     def wire(self) -> dict[str, object]:
-        """See `DeviceConfig`."""
         return {"make": self.driver} | self.model_dump(mode="json", include={"unit", "counts_per_turn", "registers"})
 
     @model_validator(mode="after")

@@ -44,12 +44,10 @@ class TmclRailConfig(RailConfig):
 
     @property
     def counted(self) -> tuple[int, int]:
-        """See `RailConfig`."""
         return self.steps_per_turn, self.microsteps
 
     @property
     def turned_round(self) -> bool:
-        """See `RailConfig`."""
         return self.reversed
 
     @model_validator(mode="after")

@@ -112,11 +112,9 @@ class CanopenVehicleConfig(CanVehicleConfig):
 
     @property
     def count_length(self) -> float:
-        """See `VehicleConfig`."""
         return self.wheels().count_length
 
     def wire(self) -> dict[str, object]:
-        """See `DeviceConfig`."""
         keys = {
             "left_node", "right_node", "wheel_radius", "gear", "counts_per_turn", "velocity_unit", "left_reversed",
             "right_reversed",
@@ -130,7 +128,6 @@ class CanopenVehicleConfig(CanVehicleConfig):
         return {"make": self.driver, **self.model_dump(include=keys), **lines}
 
     def answers(self) -> tuple[str, bool]:
-        """See `DeviceConfig`."""
         return look_at_nodes(self)
 
     def wheels(self) -> WheelDrives:

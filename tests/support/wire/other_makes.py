@@ -4,7 +4,10 @@ import re
 import tomllib
 from typing import Any
 
+import pytest
+
 from cell.config.cell_config import CellConfig, tables_of, validate
+from drivers.errors import ConfigError
 from tests.support import ROOT
 
 PRINTED = [
@@ -27,3 +30,10 @@ def cell(*tables: dict[str, Any], **changed: Any) -> CellConfig:
         device, _, name = key.partition("__")
         made[device] = {**made[device], name: value}
     return validate(CellConfig, made, "cell.toml")
+
+
+def refusal_of(*tables: dict[str, Any]) -> str:
+    """What is said of a cell with these tables."""
+    with pytest.raises(ConfigError) as met:
+        cell(*tables)
+    return str(met.value)

@@ -164,9 +164,8 @@ def test_what_rests_on_a_check_that_came_out_wrong_waits_though_it_was_good_befo
 def test_what_a_person_would_not_do_is_not_good(tmp_path, monkeypatch, check: str):
     files(tmp_path)
     made = opened(tmp_path, Shown())
-    unwilling = ("Keep a hand below", "Press the emergency stop")
     with closing(made.workplace):
         monkeypatch.setattr(made.workplace, "simulated", False)
-        monkeypatch.setattr(made.workplace.person, "_ask", lambda text: not text.startswith(unwilling))
+        monkeypatch.setattr(made.workplace.person, "_ask", lambda text: not text.startswith(("Keep", "Press")))
         with pytest.raises(RefusedError, match="not tried"):
             by_name(check).work(made.workplace, Result())

@@ -96,15 +96,11 @@ def test_ctrl_c_stops_the_cell_before_its_server_is_waited_for(cell: Cell, monke
     ended: list[str | None] = []
     close = ServerProcess.close
 
-    def closing(server: ServerProcess) -> None:
-        ended.append(run.control.token.reason)
-        close(server)
-
     def waits(run: Run[None]) -> None:
         while run.control.token.reason is None:
             time.sleep(0.01)
 
-    monkeypatch.setattr(ServerProcess, "close", closing)
+    monkeypatch.setattr(ServerProcess, "close", lambda server: (ended.append(run.control.token.reason), close(server)))
     run = cell.begin("check", waits, None, cell.stops)
     threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
     assert shown(cell, "pot", Address(), open_page=False) == 130
