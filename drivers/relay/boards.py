@@ -377,6 +377,7 @@ def open_board(name: str, kind: str, make: str, url: str, *, baud: int) -> Numat
 
 
 def open_numato(name: str, kind: str, url: str, *, baud: int) -> NumatoBoard:
+    """Open the port and see that the board answers there."""
     board = NumatoBoard(RelayPort(name, kind, url, baud=baud))
     try:
         board.ping()

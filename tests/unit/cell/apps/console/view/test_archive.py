@@ -21,10 +21,9 @@ def test_runs_of_the_archive_are_read_from_their_folders(tmp_path):
     archive = Archive(tmp_path, tmp_path, 86_400.0)
     (row,) = archive.runs()
     assert (row["d_mean_mm"], row["expected_mm"], row["outcome"]) == (0.07, 0.05, "placed")
-    # A run writes it again, with what takes long to reckon.
     (folder / "report.json").write_text((folder / "report.json").read_text().replace("0.07", "0.08"))
     os.utime(folder / "report.json", ns=(1, 1))
-    assert archive.runs()[0]["d_mean_mm"] == 0.08
+    assert archive.runs()[0]["d_mean_mm"] == 0.08, "a run writes it again, with what takes long to reckon"
     (point,) = archive.trend()
     assert point["run"] == folder.name
     run = archive.run(folder.name)
