@@ -76,7 +76,7 @@ def test_every_key_of_a_report_is_documented_and_every_documented_key_exists(
     # What other places of the program add, each only where something out of the ordinary was asked for or went wrong.
     elsewhere = {
         "injected", "not_injected", "not_injected[].fault", "not_injected[].why", "until", "scripted", "resumed_from",
-        "drive_to_target.shared", "laser_sweep.head_looked_s_ago",
+        "pace", "drive_to_target.shared", "laser_sweep.head_looked_s_ago",
         "next_item", "held.base_from_flange", "held.covariance",
         "frames_missing", "truth_missing", "picture_missing", "texture_missing", "part_mesh.file", "part_mesh.sha256",
         "place.mating.least_mm", "place.mating.median_mm", "place.mating.largest_mm", "place.mating.seen",
