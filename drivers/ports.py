@@ -1,5 +1,6 @@
 """Serial ports, opened for one program alone, and what came unasked over a socket."""
 
+import logging
 import socket
 from contextlib import suppress
 from typing import ClassVar, cast
@@ -9,13 +10,15 @@ from serial.urlhandler import protocol_socket
 
 from drivers.clock import Clock
 from drivers.errors import NotConnectedError
-from drivers.last_words import descriptor_of, log
+from drivers.last_words import descriptor_of
 
 WRITE_TIMEOUT_S = 2.0
 """Wall seconds after which a port that takes no bytes counts as stuck."""
 PARITIES = {"none": serial.PARITY_NONE, "even": serial.PARITY_EVEN, "odd": serial.PARITY_ODD}
 FAILURES = (serial.SerialException, OSError)
 """What a port raises when its other end is gone."""
+
+log = logging.getLogger(__name__)
 
 
 class SocketPort(protocol_socket.Serial):

@@ -72,7 +72,7 @@ class PhotoSection(Table):
     look_down: Annotated[float, quantity("deg", 0, 90)]
     max_obliquity: Annotated[float, quantity("deg", 5, 80)]
     max_residual: Annotated[float, number(0.01, 10)]
-    count: Annotated[int, whole(2, 100)]
+    count: Annotated[int, whole(1, 100)]
 
 
 def _checked_mesh_name(text: str) -> str:

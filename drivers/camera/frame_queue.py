@@ -1,7 +1,7 @@
 """The queue between the thread that receives frames and the one that uses them.
 
-Times are judged, each on its own and against the frame before it. A stamp that is wrong by a frame
-puts a whole line of a sweep elsewhere, and nothing in the picture shows it."""
+Times are judged, each on its own and against the frame before it. A stamp that is wrong by a frame puts a whole line of
+a sweep elsewhere, and nothing in the picture shows it."""
 
 import math
 import threading

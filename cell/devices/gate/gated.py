@@ -205,7 +205,6 @@ class GatedArm(Gated[interfaces.Arm]):
         return self.bare.digital_input(index)
 
     def recover(self, *, confirmed: bool = False) -> None:
-
         def begin() -> None:
             self.gate.interlocks.situation.last = None
             self.bare.recover(confirmed=confirmed)
@@ -276,7 +275,6 @@ class GatedVehicle(Gated[interfaces.Vehicle]):
         self.bare.check()
 
     def enable(self) -> None:
-
         def begin() -> None:
             # Only now may it drive away: one that could not be enabled still stands where it stood.
             self.bare.enable()

@@ -34,7 +34,9 @@ def photographed(workplace: Workplace, goal: pin.SE3, progress: Callable[[float,
     progress(0.1, "arm to the photograph pose")
     workplace.mover.to(goal, "the photograph pose", within=NEAR)
     progress(0.7, "photographing the board")
-    vehicle, count = workplace.config.arm.vehicle_from_base.se3().inverse(), workplace.job.photo.count
+    vehicle = workplace.config.arm.vehicle_from_base.se3().inverse()
+    # One alone does not show whether the vehicle rocks.
+    count = max(2, workplace.job.photo.count)
     return until_quiet(vehicle, lambda: workplace.photograph(count), workplace.devices.clock.sleep, progress)
 
 

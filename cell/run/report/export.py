@@ -72,8 +72,8 @@ def _deviations(cloud: StoredCloud, report: Report, name: str | None) -> NDArray
     if pose is None:
         return None
     try:
-        file = name or report["job_file"]
-        if name is None and job_hash(file) != report["job_hash"]:
+        file = name or report.get("job_file", report["job"])
+        if name is None and job_hash(file) != report.get("job_hash"):
             raise ConfigError(f"{file} or a mesh of it was changed since the run")
         job, mesh = sought(*load_job(file))
     except (ConfigError, OSError) as error:

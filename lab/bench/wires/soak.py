@@ -83,7 +83,8 @@ def counted(owner: int) -> dict[str, dict[str, float]]:
 
 def _name(words: list[str]) -> str:
     """What a process is: the module that it runs."""
-    return words[words.index("-m") + 1] if "-m" in words else Path(words[0] if words else "").name
+    script = next((word for word in words if word.endswith(".py")), words[0] if words else "")
+    return words[words.index("-m") + 1] if "-m" in words else Path(script).name
 
 
 def descendants(owner: int) -> list[int]:

@@ -30,9 +30,9 @@ from drivers.errors import Aborted, CellError, ConfigError, DeviceError, DeviceF
 from drivers.interfaces import ATTENDED_S, Arm, Attended, Motion, Rail
 
 LATE_S = 0.25
+"""A beat that was longer under way than the quickest of its page by more than this is none: the button may be up."""
 CLOCKS_PART = 2e-4
 """Seconds a second that the clocks of page and cell come apart at most: without it an hour makes all beats late."""
-"""A beat that was longer under way than the quickest of its page by more than this is none: the button may be up."""
 
 
 @dataclass(eq=False)

@@ -102,8 +102,3 @@ def test_stops_that_cannot_be_told_apart_or_found_are_refused(tmp_path, old: str
     pose = '{ translation = ["0 mm", "0 mm", "0 mm"], rotation = ["0 deg", "0 deg", "0 deg"] }'
     with pytest.raises(ConfigError, match=told):
         load_job(changed_copy("two-stations", tmp_path, old, new.replace("POSE", pose)))
-
-
-def test_a_single_photograph_is_refused_since_it_does_not_show_whether_the_vehicle_rocks(tmp_path):
-    with pytest.raises(ConfigError, match=r"photo\.count.*2 to 100"):
-        load_job(changed_copy("pot", tmp_path, "\ncount = 4", "\ncount = 1"))

@@ -9,6 +9,7 @@ import pinocchio as pin
 import pytest
 
 from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.poses import from_ur
 from cell.measure.inversion import PlacePose
 from cell.measure.vision.board.view import BoardView, parse_board
 from cell.motion.kinematics import HOME
@@ -40,6 +41,15 @@ def test_every_look_at_the_board_is_taken_with_the_exposure_that_is_configured(
     with pytest.raises(Taken):
         require_board_unmoved(workplace, fix, "before the sweep", lambda share, text: None)
     assert asked == [(CONFIG.target_camera.photo_exposure, PHOTO_RATE_HZ)] * 2
+
+
+def test_a_board_is_photographed_twice_at_least_since_one_picture_does_not_show_whether_the_vehicle_rocks(
+    placed_pot: JobRecord, station: Station
+):
+    work = station(folded=False).work
+    work.job = work.job.model_copy(update={"photo": work.job.photo.model_copy(update={"count": 1})})
+    fix = photographed(work, from_ur(placed_pot.results["board_photo"].flange), lambda share, text: None)
+    assert len(fix.views) == 2
 
 
 def test_items_share_a_photograph_until_odometry_tells_that_the_vehicle_moved(placed_pot: JobRecord, station: Station):
