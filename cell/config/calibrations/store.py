@@ -17,6 +17,7 @@ from cell.base.storage import read_json, require_date, sealed, write_json
 from cell.config.cell_config import CellConfig
 from cell.measure.calibration import Priors, ScanCalibration, ScanObservation, TargetCalibration, TargetObservation
 from cell.measure.calibration.archive import SUFFIX, Observations
+from cell.measure.calibration.drift.evidence import INTERIM_VIEW, InterimPicture
 from cell.measure.calibration.drift.reference_plate import PlateLine
 from cell.measure.calibration.drift.timing import StampTiming
 from cell.measure.calibration.judge.faults import SCALE_RANGE, refuse_wrong_lead
@@ -24,6 +25,7 @@ from cell.measure.calibration.solve.joint import Joint
 from cell.measure.calibration.solve.results import Quality, adjust_scan, adjust_target, sigmas
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.vision.board.board import board_pose
 from drivers.errors import CalibrationStale, ConfigError
 from drivers.make import CameraConfig, DeviceConfig, RailConfig
 
@@ -256,6 +258,10 @@ def solve_observations(observations: Observations) -> Solved:
     o = observations
     scan = adjust_scan(o.scan, o.scan_camera, np.array([1.0, 0.0, 0.0]), o.priors)
     head = replace(ScanCalibration.of(scan), witness=o.witness)
+    for seen in o.scan:
+        if seen.name == f"fine {INTERIM_VIEW}" and seen.view is not None:
+            shown = board_pose(seen.view, head.camera).camera_from_board
+            head = replace(head, interim=InterimPicture(seen.base_from_flange, seen.rail_position, shown))
     refuse_wrong_lead(head.rail_direction, o.rail_lead)
     target = adjust_target(o.target, o.target_camera, o.priors)
     if target.size is not None:

@@ -16,7 +16,7 @@ import scipy
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job, PhotoSection
 from cell.measure.calibration import ScanCalibration, TargetCalibration
-from cell.measure.calibration.drift.evidence import Reference
+from cell.measure.calibration.drift.evidence import INTERIM_VIEW, Reference
 from cell.measure.geometry.poses import compose_covariance, from_parts, from_ur, mean, transform
 from cell.measure.inversion.effects.during_sweep import require_firm, roll_of
 from cell.measure.vision.board.board import BoardPose, board_pose, find_board
@@ -315,7 +315,7 @@ def verification_views(
 
 
 def interim_view(config: CellConfig, fine: BoardSpec, scan: ScanCalibration) -> CalibrationView:
-    """One of the scan camera's calibration views, aimed as those of `verification_views`, for the look of each job.
+    """One of the scan camera's calibration views, for the look of each job: just where the arm stood for it.
 
     The rail stands near its zero, from which a sweep begins. Of the views where it does, this one's own kinematic error
     is least: 0.014 mm an axis in 16 simulated cells, where another's was 0.027. Raises `CalibrationStale` as
@@ -323,6 +323,8 @@ def interim_view(config: CellConfig, fine: BoardSpec, scan: ScanCalibration) -> 
     """
     if scan.reference is None:
         raise CalibrationStale(NO_REFERENCE)
+    if scan.interim is not None:
+        return CalibrationView(scan.interim.base_from_flange, scan.interim.rail)
     return _scan_view(config, fine, scan, scan.reference, SCAN_INTERIM)
 
 
@@ -390,7 +392,7 @@ def _looking(base_from_board: pin.SE3, board: BoardSpec, drawn: Sequence[float])
     return centre * from_parts(np.zeros(3), rotation) * from_parts(1e-3 * np.array([along, across, -depth]))
 
 
-SCAN_VERIFICATION, SCAN_INTERIM, TARGET_VERIFICATION = 6, 16, 5
+SCAN_VERIFICATION, SCAN_INTERIM, TARGET_VERIFICATION = 6, INTERIM_VIEW - 1, 5
 EDGE_PX, LEAST_DOTS, RAIL_STEP, LEAST_WAY = 12.0, 0.5, 1e-3, 0.02
 
 # Offset of the optical axis along and across the board in mm, depth in mm, tilts about x and y and turn about z in deg.

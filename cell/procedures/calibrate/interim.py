@@ -56,18 +56,18 @@ class InterimCheck:
 
     @classmethod
     def of(
-        cls, calibration: CellCalibration, job: Job, looks: Sequence[ScanObservation], middle: float
+        cls, config: CellConfig, calibration: CellCalibration, job: Job, looks: Sequence[ScanObservation]
     ) -> Self:  # fmt: skip
-        """From photographs of the fine board, each from a rest of its own; raises what `interim_view` raises.
-
-        `middle` is where the rail stands in the middle of a sweep, m: a head that turns takes its rail along.
-        """
-        scan = calibration.scan
+        """From photographs of the fine board, each from a rest of its own; raises what `interim_view` raises."""
+        scan, repeats = calibration.scan, (config.arm.repeatability, config.arm.repeatability_angle)
+        # A head that turns takes its rail along: what counts is where it stands in the middle of a sweep.
+        middle = 0.5 * sum(config.rail.travel)
         near = scan.reference
         if near is None:
             raise CalibrationStale(NO_REFERENCE)
         seen = [PictureMeasurements(dots_of(look), k, k) for k, look in enumerate(looks)]
-        head, does = HeadShift.of(scan.state(near.base_from_board), near, seen), at_place(calibration, job, middle)
+        head = HeadShift.of(scan.state(near.base_from_board), near, seen, repeats, scan.interim)
+        does = at_place(calibration, job, middle)
         effects = [does("scan", change) for change in head.drawn(DRAWS)]
         seen_at = middle * scan.rail_direction + np.array([0.0, 0.0, job.scan.stand_off])
         ahead = scan.flange_from_camera.rotation @ seen_at
@@ -186,7 +186,7 @@ def interim_check(
             )
         flange = from_ur(devices.arm.state().flange)
         looks.append(ScanObservation(seen, None, flange, rail.state().position))
-        found = InterimCheck.of(calibration, job, looks, 0.5 * sum(config.rail.travel))
+        found = InterimCheck.of(config, calibration, job, looks)
         if len(looks) == LOOKS or found.head.changed or not found.head.suspicious:
             return found
         # From where it rests: over a shorter way friction brings the arm back to the very place that it just had.

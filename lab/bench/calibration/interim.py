@@ -92,14 +92,14 @@ def planted() -> list[PlantedShift]:
 def campaign(seeds: Sequence[int], level: str, untouched: int, done: Done, workers: int = 0) -> Row:
     """`untouched` checks of each seed's cell as it is, and one under each planted shift; figures in mm."""
     worlds = over_cores([(one_world, level, untouched, seed) for seed in seeds], workers, lambda rows: done("cells"))
-    rows = [row for world in worlds for row in world]
+    rows, calibrated = [row for world in worlds for row in world], sum(map(bool, worlds))
     names = [UNTOUCHED, *(each.name for each in planted())]
     creeping = [row for row in rows if row["shift"] == CREEPING]
     shifts = {name: _tally([row for row in rows if row["shift"] == name]) for name in names}
-    shares = [shifts[each.name]["found"] / len(seeds) for each in planted()]
+    shares = [shifts[each.name]["found"] / max(calibrated, 1) for each in planted()]
     return {
-        "level": level, "seeds": len(seeds), "shifts": shifts, "found": float(np.mean(shares)),
-        "least_found": min(shares),
+        "level": level, "seeds": len(seeds), "calibrated": calibrated, "shifts": shifts,
+        "found": float(np.mean(shares)), "least_found": min(shares),
         "creeping_found_at_mm": _found_at(creeping), "runs": rows,
     }  # fmt: skip
 
@@ -108,7 +108,7 @@ CREEPING = f"scan head, creeps {1e3 * CREEP_M:.2f} mm a job"
 
 
 def one_world(level: str, untouched: int, seed: int) -> list[Row]:
-    """All checks of one cell."""
+    """All checks of one cell; none where its calibration is refused."""
     config, (job, mesh) = load_config(None), load_job("pot")
     nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
 
@@ -147,7 +147,10 @@ def one_world(level: str, untouched: int, seed: int) -> list[Row]:
             rows.append({**look(CREEPING), "by_mm": 1e3 * k * CREEP_M})
         return rows
 
-    return on_calibrated(config, job, nominal, seed, level, work)
+    try:
+        return on_calibrated(config, job, nominal, seed, level, work)
+    except RefusedError:
+        return []
 
 
 def _refused(found: InterimCheck) -> bool:

@@ -6,7 +6,7 @@ parameters of one camera's chain, against none. A calibration leaves a `Referenc
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -33,7 +33,7 @@ from cell.measure.calibration.solve.normal import (
     stripe_block,
 )
 from cell.measure.geometry.camera import Array
-from cell.measure.geometry.poses import from_matrix
+from cell.measure.geometry.poses import from_matrix, from_parts
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +89,44 @@ class Reference:
         )  # fmt: skip
 
 
+INTERIM_VIEW = 17
+"""Which of the scan camera's calibration views, from 1, each job looks from again."""
+
+
+@dataclass(frozen=True, eq=False)
+class InterimPicture:
+    """The calibration's own picture of the fine board, from where each job looks at it again.
+
+    `base_from_flange` and `rail` (m) are as reported then, `camera_from_board` is where that picture alone has the
+    board.
+    """
+
+    base_from_flange: pin.SE3
+    rail: float
+    camera_from_board: pin.SE3
+
+    def as_dict(self) -> dict[str, object]:
+        """For storage."""
+        poses = {"base_from_flange": self.base_from_flange, "camera_from_board": self.camera_from_board}
+        return {"rail": self.rail, **{name: pose.homogeneous.tolist() for name, pose in poses.items()}}
+
+    @classmethod
+    def read(cls, data: dict[str, Any] | None) -> Self | None:
+        """From storage, None for None; KeyError, TypeError or ValueError when it is not one."""
+        if data is None:
+            return None
+        return cls(
+            from_matrix(data["base_from_flange"]), float(data["rail"]), from_matrix(data["camera_from_board"])
+        )  # fmt: skip
+
+    def measured(self, state: AdjustmentState, like: ViewData) -> ViewData:
+        """Its dots, those that a later picture shows of the same board."""
+        camera = self.base_from_flange * state.flange_from_camera * from_parts(self.rail * state.rail_direction)
+        there = replace(state, base_from_board=camera * self.camera_from_board)
+        off, _ = dots_block(there, like, self.base_from_flange, self.rail)
+        return replace(like, pixels=like.pixels - off, base_from_flange=self.base_from_flange, rail=self.rail)
+
+
 # The lens model itself is no better than this; it keeps few-thousandths noise from making a test of the model.
 LEAST_DOTS_PX = 0.02
 # 8 ms at 12 mm/s: generous, so that a busy computer does not look like a moved laser.
@@ -132,25 +170,35 @@ class DriftEvidence:
         return np.asarray(inverse @ directions.T @ self.score), np.asarray(0.5 * (inverse + inverse.T))
 
 
-def evidence(state: AdjustmentState, reference: Reference, looks: Sequence[PictureMeasurements]) -> DriftEvidence:
+def evidence(
+    state: AdjustmentState, reference: Reference, looks: Sequence[PictureMeasurements],
+    repeats: tuple[float, float] | None = None, before: Sequence[PictureMeasurements] = (),
+) -> DriftEvidence:  # fmt: skip
     """Weigh observations against a calibration whose `state` holds the calibrated values and the board.
 
     With residual r, derivative J of all parameters q and their prior covariance Σ the misfit's covariance is
-    S = R + JΣJᵀ; JᵀS⁻¹r = (I + HΣ)⁻¹g and JᵀS⁻¹J = (I + HΣ)⁻¹H for H = JᵀR⁻¹J, g = JᵀR⁻¹r (matrix inversion lemma).
+    S = R + JΣJᵀ. A change shows in the rows D of J that are of `looks`. With H = JᵀR⁻¹J, g = JᵀR⁻¹r and C = DᵀR⁻¹J the
+    score DᵀS⁻¹r is DᵀR⁻¹r − CΣ(I + HΣ)⁻¹g, the information DᵀS⁻¹D is DᵀR⁻¹D − CΣ(I + HΣ)⁻¹Cᵀ (matrix inversion lemma).
+
+    Where all looks are from one posture, `repeats` (m, rad) is how well the arm comes back to it, one standard
+    deviation an axis: the rest of its scatter is the posture's own, the same at each rest. Pictures from `before` the
+    change show how large that is.
     """
-    rests = 1 + max(look.rest for look in looks)
-    stops = 1 + max(look.stop for look in looks)
+    every = [*looks, *before]
+    rests = 1 + max(look.rest for look in every)
+    stops = 1 + max(look.stop for look in every)
     size = SHARED + 6 * rests + stops
     prior = np.zeros((size, size))
     prior[:SHARED, :SHARED] = reference.covariance
     arm = np.repeat([reference.arm_translation**2, reference.arm_rotation**2], 3)
     rails = np.full(stops, reference.rail**2)
-    rails[[look.stop for look in looks if look.sweeping]] += SWEEP_RAIL_M**2
-    own = np.concatenate([np.tile(arm, rests), rails])
-    prior[np.arange(SHARED, size), np.arange(SHARED, size)] = own
-    kinds: dict[str, list[tuple[Array, Array]]] = {"dots": [], "stripe": []}
+    rails[[look.stop for look in every if look.sweeping]] += SWEEP_RAIL_M**2
+    own = arm if repeats is None else np.minimum(arm, np.repeat(np.square(repeats), 3))
+    prior[np.arange(SHARED, size), np.arange(SHARED, size)] = np.concatenate([np.tile(own, rests), rails])
+    prior[SHARED : size - stops, SHARED : size - stops] += np.kron(np.ones((rests, rests)), np.diag(arm - own))
+    kinds: dict[str, list[tuple[Array, Array]]] = {"dots": [], "stripe": [], "before": []}
     along: list[Array] = []
-    for look in looks:
+    for number, look in enumerate(every):
         index = np.concatenate([
             np.arange(SHARED), SHARED + 6 * look.rest + np.arange(6), [SHARED + 6 * rests + look.stop]
         ])  # fmt: skip
@@ -158,23 +206,25 @@ def evidence(state: AdjustmentState, reference: Reference, looks: Sequence[Pictu
         if len(view.points):
             residual, jacobian = dots_block(state, view, view.base_from_flange, view.rail)
             sigma = np.repeat(np.maximum(reference.dots_scale * view.sigma, LEAST_DOTS_PX), 2)
-            kinds["dots"].append(_white(residual.ravel(), jacobian.reshape(-1, COLUMNS), sigma, index, size))
+            kind = "dots" if number < len(looks) else "before"
+            kinds[kind].append(_white(residual.ravel(), jacobian.reshape(-1, COLUMNS), sigma, index, size))
         if len(view.stripe) and state.plane is not None:
             residual, jacobian, sigma = stripe_block(state, view, view.base_from_flange, view.rail)
             kinds["stripe"].append(_white(residual, jacobian, reference.stripe_scale * sigma, index, size))
             along.append(kinds["stripe"][-1][1][:, index[-1:]])
-    rows = [pair for pairs in kinds.values() for pair in pairs]
-    normal = np.sum([j.T @ j for _, j in rows], axis=0)
-    right = np.sum([j.T @ r for r, j in rows], axis=0)
-    mixed = np.eye(size) + normal @ prior
-    score, information = np.linalg.solve(mixed, right), np.linalg.solve(mixed, normal)
-    shared = information[:SHARED, :SHARED]
+    rows = [*kinds["dots"], *kinds["stripe"]]
+    by_change, changed = np.sum([j.T @ j for _, j in rows], axis=0), np.sum([j.T @ r for r, j in rows], axis=0)
+    normal = by_change + np.sum([j.T @ j for _, j in kinds["before"]], axis=0)
+    right = changed + np.sum([j.T @ r for r, j in kinds["before"]], axis=0)
+    explained = by_change[:SHARED] @ prior @ np.linalg.inv(np.eye(size) + normal @ prior)
+    score = changed[:SHARED] - explained @ right
+    information = by_change[:SHARED, :SHARED] - explained @ by_change[:, :SHARED]
     # Dots may be anywhere that a camera's move or lens puts them, the stripe on any plane.
     dots = _misfit(kinds["dots"], np.r_[CAMERA, SHARED:size])
     stripe = _misfit(
         kinds["stripe"], np.r_[BOARD], scipy.linalg.block_diag(*along) * SWEEP_PICTURE_M if along else None
     )
-    return DriftEvidence(score[:SHARED], 0.5 * (shared + shared.T), dots, stripe)
+    return DriftEvidence(score, 0.5 * (information + information.T), dots, stripe)
 
 
 def dots_of(photo: ScanObservation) -> ViewData:

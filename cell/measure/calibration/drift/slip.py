@@ -16,7 +16,13 @@ import numpy as np
 import scipy
 
 from cell.measure.calibration.drift.decision import WORST_FIT
-from cell.measure.calibration.drift.evidence import DriftEvidence, PictureMeasurements, Reference, evidence
+from cell.measure.calibration.drift.evidence import (
+    DriftEvidence,
+    InterimPicture,
+    PictureMeasurements,
+    Reference,
+    evidence,
+)
 from cell.measure.calibration.drift.reference_plate import (
     LARGEST_RAD,
     NOTED_RAD,
@@ -243,12 +249,21 @@ class HeadShift:
     looks: int
 
     @classmethod
-    def of(cls, state: AdjustmentState, reference: Reference, looks: Sequence[PictureMeasurements]) -> Self:
-        """From pictures of the board, each from a rest of its own, beside the calibrated `state`.
+    def of(
+        cls, state: AdjustmentState, reference: Reference, looks: Sequence[PictureMeasurements],
+        repeats: tuple[float, float], then: InterimPicture | None = None,
+    ) -> Self:  # fmt: skip
+        """From pictures of the board, each from a rest of its own in one posture, beside the calibrated `state`.
+
+        `repeats` (m, rad) is the arm's repeatability, one standard deviation an axis, `then` the calibration's picture.
 
         A head that slipped is shifted or turned, seldom both, so each is held against chance by itself.
         """
-        weighed = evidence(state, reference, looks)
+        before = []
+        if then is not None:
+            own = 1 + max(look.rest for look in looks), 1 + max(look.stop for look in looks)
+            before = [PictureMeasurements(then.measured(state, looks[0].data), *own)]
+        weighed = evidence(state, reference, looks, repeats, before)
         hand = np.eye(SHARED)[:, HAND]
         change, covariance = weighed.change(hand)
         score, information = hand.T @ weighed.score, hand.T @ weighed.information @ hand
