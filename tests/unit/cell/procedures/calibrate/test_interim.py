@@ -67,6 +67,16 @@ def test_a_cell_that_nobody_touched_passes_and_says_what_it_saw(
     assert np.linalg.norm(rest.actInv(pose_of(placed_pot.at_end, "base_from_flange")).translation) < 1e-3
 
 
+def test_each_job_looks_from_where_the_calibration_looked(placed_pot: JobRecord):
+    calibration = placed_pot.calibration
+    then, view = calibration.scan.interim, fine_board_view(CONFIG, calibration)
+    assert (view.base_from_flange, view.rail_position) == (then.base_from_flange, then.rail)
+    assert type(calibration.scan).from_dict(calibration.scan.as_dict()).interim.as_dict() == then.as_dict()
+    older = replace(calibration, scan=replace(calibration.scan, interim=None))
+    aimed = fine_board_view(CONFIG, older).base_from_flange
+    assert 1e-5 < np.linalg.norm(aimed.actInv(then.base_from_flange).translation) < 0.02
+
+
 def test_what_moves_the_place_too_far_refuses_with_the_number_and_the_next_step(placed_pot: JobRecord):
     found, kept = looked(placed_pot, SHIFTS["last joint's zero, 4 mrad"].put_in)
     assert found.head.changed and found.matters and len(kept) == found.head.looks == 1

@@ -95,6 +95,18 @@ def test_a_shift_and_a_turn_are_found_and_told_by_how_much(calibrated: Calibrate
     assert found.change[3 + axis] == pytest.approx(1e-3, abs=4.0 * np.sqrt(found.covariance[3 + axis, 3 + axis]))
 
 
+def test_what_the_arm_errs_by_in_that_posture_is_no_change_of_the_head(calibrated: Calibrated, monkeypatch):
+    cell, calibration = calibrated
+    truth, off = cell.truth, shifted(np.array([0.25e-3, 0.0, 0.0]))
+    scan = replace(calibration.scan, reference=replace(calibration.scan.reference, arm_translation=0.15e-3))
+    monkeypatch.setattr(cell, "truth", replace(truth, base_from_fine=off @ truth.base_from_fine))
+    camera = scan.interim.base_from_flange * scan.flange_from_camera_at(scan.interim.rail)
+    then = camera.inverse() * from_matrix(off) * camera * scan.interim.camera_from_board
+    as_then = replace(scan, interim=replace(scan.interim, camera_from_board=then))
+    assert look(cell, replace(calibration, scan=scan), 4).changed
+    assert not look(cell, replace(calibration, scan=as_then), 4).changed
+
+
 def test_a_board_that_was_bent_fits_badly_wherever_the_head_is(calibrated: Calibrated, monkeypatch):
     monkeypatch.setattr(calibrated[0], "bend", 0.2e-3)
     found = look(*calibrated, 1)

@@ -93,6 +93,13 @@ def test_a_slipped_mount_is_named_with_the_view():
         check(before[:9] + after[9:])
 
 
+def test_what_an_arm_may_err_by_at_its_postures_is_no_slip():
+    cell = world(3)
+    before = rests(cell)
+    cell.truth = replace(cell.truth, flange_from_scan=cell.truth.flange_from_scan @ shifted(np.array([1e-4, 0, 0])))
+    check(before[:9] + rests(cell)[9:])
+
+
 def test_a_wrong_lead_is_named_with_the_right_one():
     cell, scale = world(3), 1.25
     cell.truth = replace(cell.truth, rail_direction=scale * cell.truth.rail_direction)
