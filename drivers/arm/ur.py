@@ -65,21 +65,12 @@ class UrArm:
     """
 
     def __init__(
-        self,
-        name: str,
-        address: str,
-        *,
-        limits: ArmLimits | None = None,
+        self, name: str, address: str, *, limits: ArmLimits | None = None,
         payload: tuple[float, tuple[float, float, float]] = (0.0, (0.0, 0.0, 0.0)),
-        safe_off_outputs: tuple[int, ...] = (),
-        braking: float = 4.0,
-        connect_timeout: float = 10.0,
-        forward: Forward | None = None,
-        forward_of: Callable[[LinkTable | None], Forward] | None = None,
-        control: bool = True,
-        model: str = "",
-        clock: Clock,
-    ) -> None:
+        safe_off_outputs: tuple[int, ...] = (), braking: float = 4.0, connect_timeout: float = 10.0,
+        forward: Forward | None = None, forward_of: Callable[[LinkTable | None], Forward] | None = None,
+        control: bool = True, model: str = "", clock: Clock,
+    ) -> None:  # fmt: skip
         self.name = name
         self.limits = limits or ArmLimits()
         self._clock = clock

@@ -82,16 +82,11 @@ class RigSpec:
     def as_dict(self) -> dict[str, float | int | str | list[float]]:
         """For reports, in mm and µm."""
         return {
-            "sensor_px": f"{self.width} × {self.height}",
-            "pixel_um": 1e6 * self.pixel,
-            "focal_mm": 1e3 * self.focal,
-            "baseline_mm": 1e3 * self.baseline,
-            "light_plane_meets_axis_mm": 1e3 * self.meeting,
-            "depths_mm": [1e3 * z for z in self.depths],
-            "rail_travel_mm": 1e3 * self.travel,
-            "calibration_views": self.views,
-            "board": self.board,
-        }
+            "sensor_px": f"{self.width} × {self.height}", "pixel_um": 1e6 * self.pixel, "focal_mm": 1e3 * self.focal,
+            "baseline_mm": 1e3 * self.baseline, "light_plane_meets_axis_mm": 1e3 * self.meeting,
+            "depths_mm": [1e3 * z for z in self.depths], "rail_travel_mm": 1e3 * self.travel,
+            "calibration_views": self.views, "board": self.board,
+        }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,19 +26,11 @@ LINES = 8
 
 def pattern_parameters(board: Board) -> Vector:
     """(12,) kind, cols, rows, pitch, bounds, albedos and dot radius: what the kernels take."""
-    return np.array(
-        [
-            KINDS.index(board.kind),
-            board.cols,
-            board.rows,
-            board.pitch,
-            *board.bounds,
-            board.white,
-            board.black,
-            board.dot_radius,
-            board.dot_radius / 2,
-        ]
-    )
+    dot = board.dot_radius
+    return np.array([
+        KINDS.index(board.kind), board.cols, board.rows, board.pitch, *board.bounds, board.white, board.black, dot,
+        dot / 2,
+    ])  # fmt: skip
 
 
 def plain_parameters(bounds: tuple[float, float, float, float], albedo: float) -> Vector:

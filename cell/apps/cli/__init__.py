@@ -11,19 +11,9 @@ from pathlib import Path
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 OPENING = (
-    "run",
-    "dry-run",
-    "resume",
-    "calibrate",
-    "home",
-    "jog",
-    "diag",
-    "commission",
-    "console",
-    "new-job",
-    "sim",
+    "run", "dry-run", "resume", "calibrate", "home", "jog", "diag", "commission", "console", "new-job", "sim",
     "qualify",
-)
+)  # fmt: skip
 """Commands that open a cell, or simulate one; `cell abort` and its like need little."""
 LEAST_MEMORY_B = 3_000_000_000
 """Of addresses (`ulimit -v`): a run takes 2 GB on two cores, each further core some more for its threads."""

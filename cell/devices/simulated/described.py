@@ -99,25 +99,19 @@ def _station(job: Job, mesh: Path, drives: bool) -> drawn.StationDrawing:
         height=-float(approach.target.se3().translation[2]),
         # To a fixed frame the station is brought, to where the job has it.
         place_from_start=_matrix((approach.start if drives else approach.target).se3()),
-        board=job.board.spec,
-        place_from_board=_matrix(job.place_from_board),
+        board=job.board.spec, place_from_board=_matrix(job.place_from_board),
         place_from_surface=_matrix(there.place_from_surface.se3()),
-        surface=shipped or mesh.stem,
-        mesh="" if shipped else str(mesh.resolve()),
-        mesh_unit=there.mesh_unit,
+        surface=shipped or mesh.stem, mesh="" if shipped else str(mesh.resolve()), mesh_unit=there.mesh_unit,
         flange_from_part=_matrix(job.grasp.flange_from_part.se3()),
-        surface_from_part=_matrix(job.place.surface_from_part.se3()),
-        part_size=job.grasp.size,
+        surface_from_part=_matrix(job.place.surface_from_part.se3()), part_size=job.grasp.size,
         obstacles=_boxes({o.name: (o.place_from_centre, o.size) for o in job.obstacle}),
-        part_mesh="" if part is None else part.mesh,
-        part_mesh_unit="m" if part is None else part.mesh_unit,
+        part_mesh="" if part is None else part.mesh, part_mesh_unit="m" if part is None else part.mesh_unit,
         nest=None if nest is None else _matrix(nest.base_from_part.se3()),
-        nest_filled=nest is not None and not job.unloads,
-        stop=job.at_stop or "",
+        nest_filled=nest is not None and not job.unloads, stop=job.at_stop or "",
         place_from_stop=next(
             (_matrix(stop.frame) for stop in job.stop if stop.name == job.at_stop and stop.place_from_stop), None
         ),
-    )
+    )  # fmt: skip
     return drawn.settled(station, STOCK.station)
 
 

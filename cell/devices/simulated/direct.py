@@ -91,27 +91,16 @@ def setup_of(config: CellConfig) -> DirectSetup:
         raise ConfigError(f'rail.driver = "{rail.driver}" does not say how it counts; name another make, or use wires')
     return DirectSetup(
         ArmLimits(
-            joint_speeds=(arm.max_joint_speed,) * 6,
-            joint_acceleration=arm.max_joint_acceleration,
-            linear_speed=arm.max_tool_speed,
-            reach=MODELS[arm.model].reach,
-            payload=MOST_PAYLOAD[arm.model],
+            joint_speeds=(arm.max_joint_speed,) * 6, joint_acceleration=arm.max_joint_acceleration,
+            linear_speed=arm.max_tool_speed, reach=MODELS[arm.model].reach, payload=MOST_PAYLOAD[arm.model],
         ),
         safe_off_outputs(config),
         RailSetup(
-            rail.lead,
-            *rail.counted,
-            rail.travel,
-            rail.max_speed,
-            rail.acceleration,
-            rail.turned_round,
+            rail.lead, *rail.counted, rail.travel, rail.max_speed, rail.acceleration, rail.turned_round,
             rail.untold_serial,
         ),
         VehicleSetup(
-            vehicle.max_speed,
-            vehicle.max_yaw_rate,
-            track=vehicle.track,
-            make=vehicle.MODEL or vehicle.driver,
+            vehicle.max_speed, vehicle.max_yaw_rate, track=vehicle.track, make=vehicle.MODEL or vehicle.driver,
             count=vehicle.count_length,
         ),
-    )
+    )  # fmt: skip

@@ -115,15 +115,9 @@ def seen_points(
 
 @compiled
 def pose_equations(
-    lens: Array,
-    rotation: Array,
-    translation: Array,
-    points: Array,
-    factor: Array,
-    residual: Array,
-    normal: Array,
+    lens: Array, rotation: Array, translation: Array, points: Array, factor: Array, residual: Array, normal: Array,
     right: Array,
-) -> None:  # pragma: no cover
+) -> None:  # pragma: no cover  # fmt: skip
     """Writes the normal matrix (6, 6) and the right side (6,) for a small move of a board's pose in the camera.
 
     From `residual` (n, 2) in px, each point's weighted by `factor` (n,) squared. The move is (δt, δφ) in camera axes.
@@ -183,18 +177,9 @@ def _add_tilt(tilted: Array, normal: tuple[float, float, float], flange: Array, 
 
 @compiled
 def dots_terms(
-    lens: Array,
-    board: Array,
-    flange: Array,
-    hand: Array,
-    places: Array,
-    rail: float,
-    travel: Array,
-    points: Array,
-    radius: float,
-    pixels: Array,
-    jacobian: Array,
-) -> None:  # pragma: no cover
+    lens: Array, board: Array, flange: Array, hand: Array, places: Array, rail: float, travel: Array, points: Array,
+    radius: float, pixels: Array, jacobian: Array,
+) -> None:  # pragma: no cover  # fmt: skip
     """Writes the pixels (n, 2) of a calibration view's points (n, 3) and their derivatives (n, 2, 34).
 
     `board`, `flange` and `hand` are the rotations (3, 3) of base_from_board, base_from_flange and flange_from_camera,

@@ -55,19 +55,11 @@ ROOM_M = 1e-3
 
 
 def laser_sweep(
-    workplace: Workplace,
-    base_from_surface: pin.SE3,
-    head: ScanCalibration,
-    scan: ScanSection,
-    *,
-    keep_frame: Callable[[Frame, Cut | None], None],
-    check: Callable[[], None],
-    progress: Callable[[float, str], None],
+    workplace: Workplace, base_from_surface: pin.SE3, head: ScanCalibration, scan: ScanSection, *,
+    keep_frame: Callable[[Frame, Cut | None], None], check: Callable[[], None], progress: Callable[[float, str], None],
     sweeping: Callable[[SweepCollector, pin.SE3], None] = lambda collector, base_from_surface: None,
-    most_lost: float = MAX_LOST_FRACTION,
-    counted: bool = True,
-    back: bool = False,
-) -> SweepRecord:
+    most_lost: float = MAX_LOST_FRACTION, counted: bool = True, back: bool = False,
+) -> SweepRecord:  # fmt: skip
     """Sweep the scan head over each strip of `scan`, by rail or arm as `scan.mode` says; the other way if `back`.
 
     `sweeping` is told where the surface is taken to be beside who takes the frames. `check` raises when the run is to

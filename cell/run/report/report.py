@@ -184,14 +184,9 @@ class FinishedJob:
         truth = place_error(job, nominal, now)
         assert isinstance(sweep, SweepRecord)
         truth["bound_mm"] = expected_error(
-            job,
-            nominal,
-            pose,
-            sweep.base_from_flange,
-            sweeps=len(sweep.swaths),
-            configured=self.repeatability,
+            job, nominal, pose, sweep.base_from_flange, sweeps=len(sweep.swaths), configured=self.repeatability,
             truth=now,
-        )
+        )  # fmt: skip
         if isinstance(made, Reconstruction) and witness.at_sweep is not None:
             truth["sensor_mm"] = sensor_error(made.cloud, nominal, witness.at_sweep)
         report["truth"] = truth

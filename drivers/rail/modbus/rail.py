@@ -29,28 +29,16 @@ class ModbusRail(RailAxis):
 
     def __init__(self, name: str, record: ModbusRailConfig, *, clock: Clock, control: bool = True) -> None:
         super().__init__(
-            name,
-            clock,
-            travel=record.travel,
-            max_speed=record.max_speed,
-            acceleration=record.acceleration,
-            counts=record.counts_per_turn / record.lead,
-            control=control,
-        )
+            name, clock, travel=record.travel, max_speed=record.max_speed, acceleration=record.acceleration,
+            counts=record.counts_per_turn / record.lead, control=control,
+        )  # fmt: skip
         self.registers = record.registers
         self._in_position = record.in_position
         self._serial = record.serial
         self._link: ModbusLink = ModbusLink(
-            name,
-            record.url,
-            unit=record.unit,
-            baud=record.baud,
-            parity=record.parity,
-            stop_bits=record.stop_bits,
-            stop_action=record.registers.stop,
-            clock=clock,
-            statistics=self.statistics,
-        )
+            name, record.url, unit=record.unit, baud=record.baud, parity=record.parity, stop_bits=record.stop_bits,
+            stop_action=record.registers.stop, clock=clock, statistics=self.statistics,
+        )  # fmt: skip
         try:
             self._drive = ModbusDrive(self._link, record)
             self._check_ramp()
@@ -101,15 +89,10 @@ class ModbusRail(RailAxis):
             stamp, position = later, there
         homed = not self._homing and self._zero.held()
         return RailState(
-            stamp=stamp,
-            position=position,
-            velocity=velocity,
-            homed=homed,
-            homed_here=homed and self._zero.found_here,
-            moving=moving or self._homing,
-            left_switch=drive.says(registers.left_switch),
+            stamp=stamp, position=position, velocity=velocity, homed=homed, homed_here=homed and self._zero.found_here,
+            moving=moving or self._homing, left_switch=drive.says(registers.left_switch),
             right_switch=drive.says(registers.right_switch),
-        )
+        )  # fmt: skip
 
     def _position(self) -> float:
         return self._drive.position()[1]
@@ -138,14 +121,9 @@ class ModbusRail(RailAxis):
 
     def _arrival(self, position: float, issued: int, samples: Samples, *, homed: bool = True) -> DriveArrival:
         return DriveArrival(
-            self._drive,
-            self._clock,
-            target=round(position * self._counts),
-            near=self._in_position,
-            issued=issued,
-            samples=samples,
-            zero=self._zero if homed else None,
-        )
+            self._drive, self._clock, target=round(position * self._counts), near=self._in_position, issued=issued,
+            samples=samples, zero=self._zero if homed else None,
+        )  # fmt: skip
 
     def _at_start(self) -> float:
         return super()._at_start() + self._in_position / self._counts

@@ -315,17 +315,11 @@ class FramePeer(TcpServer):
     def _identify(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
         spec = self.camera.spec
         return {
-            "model": spec.model,
-            "serial": spec.serial,
-            "firmware": spec.firmware,
-            "width": spec.width,
-            "height": spec.height,
-            "pixel_format": "mono8",
-            "exposure_min_s": spec.exposure_min,
-            "exposure_max_s": spec.exposure_max,
-            "frame_rate_max_hz": spec.frame_rate_max,
+            "model": spec.model, "serial": spec.serial, "firmware": spec.firmware, "width": spec.width,
+            "height": spec.height, "pixel_format": "mono8", "exposure_min_s": spec.exposure_min,
+            "exposure_max_s": spec.exposure_max, "frame_rate_max_hz": spec.frame_rate_max,
             **self._latch(session, request),
-        }
+        }  # fmt: skip
 
     def _configure(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
         if session.running:

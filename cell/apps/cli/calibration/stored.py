@@ -104,13 +104,9 @@ def _coverage(console: Console, figures: Summary) -> None:
 
 
 def verify(
-    config: ConfigOption = None,
-    sim: options.SimOption = None,
-    seed: options.SeedOption = 1,
-    level: options.LevelOption = Level.nominal,
-    job: options.JobOption = "pot",
-    json: JsonOption = False,
-) -> None:
+    config: ConfigOption = None, sim: options.SimOption = None, seed: options.SeedOption = 1,
+    level: options.LevelOption = Level.nominal, job: options.JobOption = "pot", json: JsonOption = False,
+) -> None:  # fmt: skip
     """Say how good the stored calibration is today, from a view of each deck board and a sweep over the fine one.
 
     Exit code 0: good, or changed by less than matters at the job's place. 1: the place may be off by a third of its
@@ -165,13 +161,9 @@ def print_verification(summary: Summary) -> None:
 
 
 def timing(
-    config: ConfigOption = None,
-    sim: options.SimOption = None,
-    seed: options.SeedOption = 1,
-    level: options.LevelOption = Level.nominal,
-    job: options.JobOption = "pot",
-    json: JsonOption = False,
-) -> None:
+    config: ConfigOption = None, sim: options.SimOption = None, seed: options.SeedOption = 1,
+    level: options.LevelOption = Level.nominal, job: options.JobOption = "pot", json: JsonOption = False,
+) -> None:  # fmt: skip
     """Sweep to and fro over the fine board on the deck and measure how late the scan camera's time stamps come.
 
     What is found is kept with the stored calibration and taken out of every sweep by the rail. A rolling shutter, and

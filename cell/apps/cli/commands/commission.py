@@ -31,20 +31,14 @@ ConfirmOption = Annotated[
 
 
 def commission(
-    only: OnlyArgument = None,
-    config: ConfigOption = None,
-    job: options.JobOption = "pot",
+    only: OnlyArgument = None, config: ConfigOption = None, job: options.JobOption = "pot",
     until: Annotated[str | None, typer.Option(help="Stop after the check of this name.")] = None,
     again: Annotated[bool, typer.Option("--again", help="Do these checks again, also those that are good.")] = False,
     show: Annotated[bool, typer.Option("--list", help="Only say how the checks stand; nothing is connected.")] = False,
-    sim: options.SimOption = None,
-    truth: TruthOption = None,
-    seed: options.SeedOption = 1,
-    level: options.LevelOption = Level.nominal,
-    clock: ClockOption = "wall",
-    confirm: ConfirmOption = None,
+    sim: options.SimOption = None, truth: TruthOption = None, seed: options.SeedOption = 1,
+    level: options.LevelOption = Level.nominal, clock: ClockOption = "wall", confirm: ConfirmOption = None,
     json: options.JsonOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Take a cell into service: checks in a safe order, each confirmed before its axis first moves.
 
     What is found wrong is named, and written into cell.toml if you agree; the old file is kept. The command goes on

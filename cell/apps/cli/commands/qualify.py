@@ -55,20 +55,11 @@ CompareOption = Annotated[
 
 
 def qualify(
-    job: JobArgument = "pot",
-    config: ConfigOption = None,
-    level: LevelOption = Level.nominal,
-    seeds: SeedsOption = None,
-    until: UntilOption = None,
-    most: MostOption = None,
-    first_seed: FirstSeedOption = 1,
-    workers: WorkersOption = None,
-    out: OutOption = None,
-    json: JsonOption = False,
-    scheduler: SchedulerOption = None,
-    cluster: ClusterOption = None,
-    compare: CompareOption = None,
-) -> None:
+    job: JobArgument = "pot", config: ConfigOption = None, level: LevelOption = Level.nominal,
+    seeds: SeedsOption = None, until: UntilOption = None, most: MostOption = None, first_seed: FirstSeedOption = 1,
+    workers: WorkersOption = None, out: OutOption = None, json: JsonOption = False, scheduler: SchedulerOption = None,
+    cluster: ClusterOption = None, compare: CompareOption = None,
+) -> None:  # fmt: skip
     """Run a job on many simulated worlds on the virtual clock: yield, figures beside their limits, what goes wrong.
 
     A campaign goes on where it was stopped. Exits 1 where a part was placed outside its tolerance unnoticed, and where

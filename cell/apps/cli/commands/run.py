@@ -105,22 +105,14 @@ def run(
 
 
 def dry_run(
-    job: JobOption = "pot",
-    config: ConfigOption = None,
-    seed: options.SeedOption = 1,
-    level: options.LevelOption = Level.nominal,
-    speed: SpeedOption = None,
-    clock: ClockOption = None,
-    inject: InjectOption = None,
-    confirm: ConfirmOption = None,
-    until: UntilOption = None,
-    json: JsonOption = False,
-    noise: NoiseOption = False,
-    console: ConsoleOption = False,
+    job: JobOption = "pot", config: ConfigOption = None, seed: options.SeedOption = 1,
+    level: options.LevelOption = Level.nominal, speed: SpeedOption = None, clock: ClockOption = None,
+    inject: InjectOption = None, confirm: ConfirmOption = None, until: UntilOption = None, json: JsonOption = False,
+    noise: NoiseOption = False, console: ConsoleOption = False,
     no_open: Annotated[bool, typer.Option("--no-open", help="With --console: print the page's link only.")] = False,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="With --console: where the page is.")] = 0,
     count: CountOption = None,
-) -> None:
+) -> None:  # fmt: skip
     """Run a job on a simulated cell, which is started and ended by itself. Calibrates it first if need be."""
     typer.echo(f"dry run of {job} in the simulated world {seed}: loading", err=True)
     from cell.check.fit import read_fitting
@@ -229,12 +221,9 @@ def _clock(config: CellConfig) -> CellClock:
 
 
 def resume(
-    name: RunArgument = None,
-    config: ConfigOption = None,
-    at_start: AtStartOption = False,
-    json: JsonOption = False,
+    name: RunArgument = None, config: ConfigOption = None, at_start: AtStartOption = False, json: JsonOption = False,
     noise: NoiseOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Run the job of an aborted, faulted or cut-short run again. A sweep that still holds is not repeated.
 
     A dry run's world has ended with it: its job is done again in the same simulated world from the start.

@@ -105,19 +105,15 @@ class InterimPicture:
     rail: float
     camera_from_board: pin.SE3
 
+    @classmethod
+    def read(cls, base_from_flange: Array, rail: float, camera_from_board: Array) -> Self:
+        """From storage; KeyError, TypeError or ValueError when it is not one."""
+        return cls(from_matrix(base_from_flange), float(rail), from_matrix(camera_from_board))
+
     def as_dict(self) -> dict[str, object]:
         """For storage."""
         poses = {"base_from_flange": self.base_from_flange, "camera_from_board": self.camera_from_board}
         return {"rail": self.rail, **{name: pose.homogeneous.tolist() for name, pose in poses.items()}}
-
-    @classmethod
-    def read(cls, data: dict[str, Any] | None) -> Self | None:
-        """From storage, None for None; KeyError, TypeError or ValueError when it is not one."""
-        if data is None:
-            return None
-        return cls(
-            from_matrix(data["base_from_flange"]), float(data["rail"]), from_matrix(data["camera_from_board"])
-        )  # fmt: skip
 
     def measured(self, state: AdjustmentState, like: ViewData) -> ViewData:
         """Its dots, those that a later picture shows of the same board."""

@@ -201,7 +201,7 @@ class ScanCalibration:
             bow_gain=np.array(plane["bow_gain"], dtype=np.float64).reshape(KEPT),
             notes=tuple(data["notes"]), witness=PlateLine.read(data["witness"]), confirmed=confirmed,
             timing=timing, shutter=shutter, unread=tuple(unread), refused=str(data.get("refused", "")),
-            interim=InterimPicture.read(data.get("interim")),
+            interim=InterimPicture.read(**data["interim"]) if data.get("interim") else None,
         )  # fmt: skip
 
 
