@@ -68,6 +68,9 @@ def require_valid(calibration: "CellCalibration") -> None:
     if (witness := scan.witness) is not None:
         _require("scan.witness.rail, m", witness.rail, -10.0, 10.0)
         _require("scan.witness.sigma, px", witness.sigma[witness.rows], 1e-9, 1e3)
+    if (seen := scan.interim) is not None:
+        there = *seen.base_from_flange.translation, *seen.camera_from_board.translation, seen.rail
+        _require("scan.interim, places in m", there, -10.0, 10.0)
 
 
 def require_covariance(name: str, covariance: Array, fixed: range) -> None:
