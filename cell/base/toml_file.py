@@ -37,7 +37,7 @@ def read_toml(path: Path, what: str, how_to_make: str) -> dict[str, object]:
             raise ConfigError(f"{what} {path} is no regular file (a pipe or a device); name a file")
         if path.stat().st_size > LARGEST_BYTES:
             raise ConfigError(f"{what} {path} is larger than 1 MB, that is no {what}; name another file")
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
         raise ConfigError(f"{what} {path} does not exist; `{how_to_make}` writes one to start from") from error
     except PermissionError as error:

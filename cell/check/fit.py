@@ -241,10 +241,16 @@ def _in_picture(key: str, board: BoardSpec, camera: CameraConfig, name: str, dep
 
 
 def _plates(config: CellConfig) -> Iterator[str]:
-    """The calibration's boards lie on the vehicle's deck."""
+    """The calibration's boards lie on the vehicle's deck, the plate on the claw where the rail takes the camera."""
     deck = vehicle_bodies()[0]
     half = 0.5 * np.array(deck.size[:2])
     top = float(deck.placement.translation[2]) + 0.5 * deck.size[2]
+    (low, high), witness = config.rail.travel, config.laser.witness
+    if witness is not None and not low <= witness <= high:
+        yield (
+            f"laser.witness {1e3 * witness:g} mm is outside rail.travel, {1e3 * low:g} to {1e3 * high:g} mm: from "
+            "there the camera sees the line on the plate on the claw"
+        )
     for name in ("fine", "large"):
         plate = getattr(config.calibration, name)
         centre = plate.base_from_board.se3() * centre_of(parse_board(plate.board))

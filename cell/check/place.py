@@ -286,6 +286,9 @@ def surface_problems(job: Job, extent: Box, mesh: Path) -> Iterator[str]:
         )
     on_place = job.surface.place_from_surface.se3()
     yield from _above_table("surface.place_from_surface puts the surface", on_place, _corners(low, high))
+    for area in job.surface.area:
+        if (area.corners[0] > high[:2]).any() or (area.corners[1] < low[:2]).any():
+            yield f'surface.area "{area.name}" lies beside the surface; correct its centre or size'
     half = 0.5 * job.scan.length
     for k, swath in enumerate(job.scan.swath):
         along = max(0.0, min(high[0], half) - max(low[0], -half))

@@ -213,7 +213,7 @@ class PlaceSection(Table):
     tolerance: Annotated[float, quantity("mm", 0.01, 10)]
     tolerance_angle: Annotated[float, quantity("mrad", 0.1, 100)]
     verify: Literal["all", "seen", "none"] = "all"
-    corrections: Annotated[int, Field(ge=0, le=5)] = 1
+    corrections: Annotated[int, whole(0, 5)] = 1
     accept: Annotated[float, quantity("mm", 0.01, 10)] | None = None
 
     @model_validator(mode="after")
@@ -317,9 +317,26 @@ class Job(Table):
         once_each("obstacle", [obstacle.name for obstacle in self.obstacle])
         if self.item and self.nest is None:
             raise ValueError("[[item]] takes parts from nests, or to them: give [nest]")
-        if (problem := self._stop_problem()) is not None:
+        if (problem := self._stop_problem() or self._twice_there()) is not None:
             raise ValueError(problem)
         return self
+
+    def _twice_there(self) -> str | None:
+        """Which item would put a part where one lies already, or take one from where none is left."""
+        known: list[tuple[str, pin.SE3, bool, int]] = []
+        for k, item in enumerate(self.item, 1):
+            nest = (item.base_from_part or self.nest.base_from_part).se3() if self.nest else pin.SE3.Identity()
+            place = (item.place_from_surface or self.surface.place_from_surface).se3()
+            loads = item.kind == "load"
+            for where, pose, full in (("its nest", nest, not loads), (f"its place {item.stop or ''}", place, loads)):
+                same = [one for one in known if one[0] == where and one[1].isApprox(pose, 1e-6)]
+                if same and same[-1][2] is full:
+                    what = (
+                        f"already has the part of item {same[-1][3]}" if full else f"is empty after item {same[-1][3]}"
+                    )
+                    return f"item {k}: {where.strip()} {what}; give it another one, or another order"
+                known.append((where, pose, full, k))
+        return None
 
     def _stop_problem(self) -> str | None:
         """What is wrong with the stops, or with how items name them."""

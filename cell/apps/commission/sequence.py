@@ -220,6 +220,8 @@ def chosen(only: Sequence[str], until: str | None) -> list[CommissionCheck]:
     if until is not None:
         last = CHECKS.index(by_name(until))
         picked = [check for check in picked if CHECKS.index(check) <= last]
+    if not picked:
+        raise ConfigError(f"nothing would be checked: {', '.join(only)} comes after {until}; leave out --until")
     return picked
 
 

@@ -120,7 +120,7 @@ class CommissionWorkplace:
     """base_from_flange at which each camera saw its board last."""
     _cell: Cell | None = None
     _config: CellConfig | None = None
-    _confirmed: set[str] = field(default_factory=set)
+    _confirmed: set[tuple[str, ...]] = field(default_factory=set)
 
     @property
     def cell(self) -> Cell:
@@ -175,12 +175,12 @@ class CommissionWorkplace:
             cause_fault(self.cell.config.cell.truth, fault)
 
     def confirm(self, axis: str, moves: str, far: str, fast: str) -> None:
-        """A person's word before the first motion of an axis in this session; raises `Declined`."""
-        if axis in self._confirmed:
+        """A person's word before an axis moves so far and so fast for the first time in this session, or `Declined`."""
+        if (axis, far, fast) in self._confirmed:
             return
         if not self.person.go_ahead(f"{axis} moves for the first time: {moves}, {far}, {fast}."):
             raise Declined(f"{axis} was not to move")
-        self._confirmed.add(axis)
+        self._confirmed.add((axis, far, fast))
 
     def look_around(self) -> None:
         """Raise when the work is to end; wait while it is paused."""

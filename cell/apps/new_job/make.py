@@ -69,6 +69,10 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
     name = job_name(asker, mesh)
     targets = folder / f"{name}.toml", _beside(folder / f"{name}.stl", mesh), folder / f"{name}.png"
     part = _part(asker, folder, name)
+    for given in (mesh, *([] if part is None else [part.given])):
+        for target in (*targets, *([] if part is None or part.same else [part.target])):
+            if target.exists() and target.samefile(given):
+                raise ConfigError(f"{target} is a mesh that was given, and would be overwritten; take another --name")
     _require_room(asker, targets if part is None or part.same else (*targets, part.target), overwrite)
     like, _ = asker.get("like", "A job at the same station (its way, photograph and speeds)", "pot", load_job)
     job = _with_part(asker, station(asker, like, name, targets[1].name, laid), part)

@@ -59,14 +59,14 @@ class InterimCheck:
         cls, config: CellConfig, calibration: CellCalibration, job: Job, looks: Sequence[ScanObservation]
     ) -> Self:  # fmt: skip
         """From photographs of the fine board, each from a rest of its own; raises what `interim_view` raises."""
-        scan, repeats = calibration.scan, (config.arm.repeatability, config.arm.repeatability_angle)
+        scan = calibration.scan
         # A head that turns takes its rail along: what counts is where it stands in the middle of a sweep.
         middle = 0.5 * sum(config.rail.travel)
         near = scan.reference
         if near is None:
             raise CalibrationStale(NO_REFERENCE)
         seen = [PictureMeasurements(dots_of(look), k, k) for k, look in enumerate(looks)]
-        head = HeadShift.of(scan.state(near.base_from_board), near, seen, repeats, scan.interim)
+        head = HeadShift.of(scan.state(near.base_from_board), near, seen, scan.interim)
         does = at_place(calibration, job, middle)
         effects = [does("scan", change) for change in head.drawn(DRAWS)]
         seen_at = middle * scan.rail_direction + np.array([0.0, 0.0, job.scan.stand_off])

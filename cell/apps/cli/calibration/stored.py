@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -229,7 +230,14 @@ def show(
     from cell.config.calibrations.store import read_calibration
 
     folder = _folder(config)
-    paths = sorted(folder.glob("*.json"), key=lambda path: path.stat().st_mtime)
+
+    def made(path: Path) -> float:
+        # What is looked for later changes the file, not when the calibration was made.
+        with suppress(CalibrationStale):
+            return read_calibration(path).made
+        return 0.0
+
+    paths = sorted(folder.glob("*.json"), key=made)
     chosen = [path for path in paths if name in (None, path.stem)]
     if not chosen:
         known = ", ".join(path.stem for path in paths) or "none"

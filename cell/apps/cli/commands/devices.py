@@ -99,8 +99,8 @@ def recover(
     import getpass
     import sys
 
-    if by is None:
-        if not sys.stdin.isatty():
+    if not (by or "").strip():
+        if by is not None or not sys.stdin.isatty():
             raise ConfigError("a person has to look at the cell first: say who has, with --by NAME")
         if not typer.confirm("Have you looked at the cell, and is the way of the arm clear?"):
             raise typer.Exit(EXIT_FAILED)

@@ -91,6 +91,8 @@ def confirm(
 
     from cell.run.folder import awaited_word
 
+    if by is not None and not by.strip():
+        raise ConfigError("--by names nobody; say who has looked")
     folder = _going(name, config)
     if (waits := awaited_word(folder)) is None:
         raise ConfigError(f"{folder.name} waits for nobody's word; there is nothing to confirm")
@@ -173,6 +175,7 @@ def report(
         from cell.run.report.page.make import write_page
 
         path = out or folder / "report.html"
+        _require_new(out)
         size = write_page(folder, path)
         if json:
             print_json({"run": folder.name, "file": str(path), "bytes": size})
@@ -212,8 +215,7 @@ def export(
     path = out or folder / f"export-{kind}{SUFFIXES[kind]}"
     if path.suffix.lower() != SUFFIXES[kind]:
         raise ConfigError(f"--out {path}: a file of format {kind} ends in {SUFFIXES[kind]}")
-    if not path.parent.is_dir():
-        raise ConfigError(f"--out {path}: there is no folder {path.parent}; make it first")
+    _require_new(out)
     written = export_run(folder, kind, path, job, end)
     if json:
         print_json(written)
@@ -306,8 +308,7 @@ def export_wires(
     path, _ = _record(name, config)
     suffix, write = FORMATS[kind]
     target = out or path.with_suffix(suffix)
-    if not target.parent.is_dir():
-        raise ConfigError(f"--out {target}: there is no folder {target.parent}; make it first")
+    _require_new(out)
     count = write(path, target)
     if json:
         print_json({"file": str(target), "lines": count})
@@ -350,6 +351,14 @@ def _record(name: str | None, config: Path | None) -> tuple[Path, Path | None]:
         return Path(name), None
     folder = find_run(folder_of_runs(config), name)
     return folder / FILE, folder
+
+
+def _require_new(out: Path | None) -> None:
+    """Raise `ConfigError` where a file that was named is there already, or its folder is not."""
+    if out is not None and not out.parent.is_dir():
+        raise ConfigError(f"--out {out}: there is no folder {out.parent}; make it first")
+    if out is not None and out.exists():
+        raise ConfigError(f"--out {out} is there already, and nothing is overwritten; name another file")
 
 
 @contextmanager

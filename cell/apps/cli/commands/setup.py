@@ -38,6 +38,10 @@ def init(
     source, (loaded, mesh) = job_path(job), load_job(job)
     meshes = [mesh] if loaded.part is None else [mesh, Path(loaded.part.mesh)]
     targets = {folder / "cell.toml": None, folder / source.name: source, **{folder / one.name: one for one in meshes}}
+    if astray := [one for one in meshes if one.parent.resolve() != source.parent.resolve()]:
+        raise ConfigError(f"{astray[0]} does not lie beside {source}: copy the job and its meshes by hand")
+    if len(targets) < 2 + len(set(meshes)):
+        raise ConfigError(f"{source.name} is what the configuration is called; give the job another name")
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{folder} is no folder; name another one")
     for target in targets:
@@ -74,13 +78,13 @@ def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption 
         checked, mesh = read_fitting(job, loaded)
         if loaded.cell.meshes:
             link_meshes(beside(source) / loaded.cell.meshes)
+        if loaded.cell.sim:
+            require_possible(loaded, loaded.cell.sim, DEVICES)
     except ConfigError as error:
         if json:
             print_json({**told, "problems": [line.strip() for line in str(error).splitlines()]})
             raise typer.Exit(EXIT_USAGE) from error
         raise
-    if loaded.cell.sim:
-        require_possible(loaded, loaded.cell.sim, DEVICES)
     examples = [key for key in example_addresses(loaded) if key.partition(".")[0] not in loaded.cell.sim]
     notes = [f"{key} is the example's, where no device is: write your own" for key in examples]
     notes += contact_notes(checked, mesh)

@@ -39,10 +39,18 @@ BEFORE_PLACING = "invert_pose"
 ALL = ("rail", "arm", "vehicle", "scan_camera", "target_camera", "laser", "claw", "calibration")
 
 
-def _calibrate(workplace: CommissionWorkplace, result: Result) -> None:
-    workplace.mover()
+def _as_configured(workplace: CommissionWorkplace) -> None:
+    """A person's word before arm and rail move as in a job, and the vehicle braked."""
+    arm = workplace.config.arm
+    fast = f"at most {math.degrees(arm.max_joint_speed):.0f} deg/s and {1e3 * arm.max_tool_speed:.0f} mm/s"
+    workplace.confirm("the arm as a whole", "planned ways above the deck", "up to its whole reach", fast)
     workplace.confirm("rail", "the carriage", "its whole travel", "its configured speed")
     workplace.confirm("laser", "laser goggles on", "at each view", "on and off")
+    workplace.brake()
+
+
+def _calibrate(workplace: CommissionWorkplace, result: Result) -> None:
+    _as_configured(workplace)
     try:
         calibration = workplace.cell.calibration()
         result.notes.append("a calibration of this cell as it is configured was stored already")
@@ -66,6 +74,7 @@ def _calibrate(workplace: CommissionWorkplace, result: Result) -> None:
 
 
 def _verify(workplace: CommissionWorkplace, result: Result) -> None:
+    _as_configured(workplace)
     verification = workplace.cell.verify(workplace.heard, workplace.job_file)
     summary = verification.summary()
     for row in summary["figures"]:

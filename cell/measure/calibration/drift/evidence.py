@@ -43,8 +43,8 @@ class Reference:
     The covariance is in the order of `cell.measure.calibration.solve.normal` (camera, light plane, rail, hand-eye,
     board), zero where nothing was estimated, and allows for the scatter that was found. `arm_translation` (m),
     `arm_rotation` (rad) and `rail` (m) are the standard deviations per axis of a flange pose and of a rail reading: as
-    configured, or as found where that was more. `dots_scale` and `stripe_scale` multiply the stated σ of dots and
-    stripe.
+    configured, or as found where that was more. `repeats` (m, rad) is how well the arm comes back to one posture; files
+    of older programs have none. `dots_scale` and `stripe_scale` multiply the stated σ of dots and stripe.
     """
 
     base_from_board: pin.SE3
@@ -54,6 +54,7 @@ class Reference:
     rail: float
     dots_scale: float
     stripe_scale: float
+    repeats: tuple[float, float] = (np.inf, np.inf)
 
     @classmethod
     def of(cls, adjusted: Adjusted) -> Self:
@@ -64,6 +65,7 @@ class Reference:
             adjusted.state.base_from_board, adjusted.reliable_covariance, priors.arm_translation * excess["shift"],
             arm_rotation=priors.arm_rotation * excess["turn"], rail=priors.rail * excess["rail"],
             dots_scale=priors.dots_scale, stripe_scale=priors.stripe_scale,
+            repeats=(priors.arm_translation, priors.arm_rotation),
         )  # fmt: skip
 
     def as_dict(self) -> dict[str, object]:
@@ -73,6 +75,7 @@ class Reference:
             "covariance": self.covariance.tolist(),
             "sigma": {"arm_translation": self.arm_translation, "arm_rotation": self.arm_rotation, "rail": self.rail},
             "scale": {"dots": self.dots_scale, "stripe": self.stripe_scale},
+            **({"repeats": list(self.repeats)} if np.isfinite(self.repeats).all() else {}),
         }
 
     @classmethod
@@ -80,12 +83,12 @@ class Reference:
         """From storage, None for None; KeyError, TypeError or ValueError when it is not one."""
         if data is None:
             return None
-        sigma, scale = data["sigma"], data["scale"]
+        sigma, scale, (shift, turn) = data["sigma"], data["scale"], data.get("repeats", (np.inf, np.inf))
         return cls(
             from_matrix(data["base_from_board"]),
             np.array(data["covariance"], dtype=np.float64).reshape(SHARED, SHARED), float(sigma["arm_translation"]),
             arm_rotation=float(sigma["arm_rotation"]), rail=float(sigma["rail"]), dots_scale=float(scale["dots"]),
-            stripe_scale=float(scale["stripe"]),
+            stripe_scale=float(scale["stripe"]), repeats=(float(shift), float(turn)),
         )  # fmt: skip
 
 
@@ -168,17 +171,16 @@ class DriftEvidence:
 
 def evidence(
     state: AdjustmentState, reference: Reference, looks: Sequence[PictureMeasurements],
-    repeats: tuple[float, float] | None = None, before: Sequence[PictureMeasurements] = (),
+    before: Sequence[PictureMeasurements] = (),
 ) -> DriftEvidence:  # fmt: skip
-    """Weigh observations against a calibration whose `state` holds the calibrated values and the board.
+    """Weigh observations in one posture of the arm against a calibration with its values and the board in `state`.
 
     With residual r, derivative J of all parameters q and their prior covariance Σ the misfit's covariance is
     S = R + JΣJᵀ. A change shows in the rows D of J that are of `looks`. With H = JᵀR⁻¹J, g = JᵀR⁻¹r and C = DᵀR⁻¹J the
     score DᵀS⁻¹r is DᵀR⁻¹r − CΣ(I + HΣ)⁻¹g, the information DᵀS⁻¹D is DᵀR⁻¹D − CΣ(I + HΣ)⁻¹Cᵀ (matrix inversion lemma).
 
-    Where all looks are from one posture, `repeats` (m, rad) is how well the arm comes back to it, one standard
-    deviation an axis: the rest of its scatter is the posture's own, the same at each rest. Pictures from `before` the
-    change show how large that is.
+    What the arm scatters beyond its repeatability is the posture's own, the same at each rest. Pictures from `before`
+    the change show how large that is.
     """
     every = [*looks, *before]
     rests = 1 + max(look.rest for look in every)
@@ -189,7 +191,7 @@ def evidence(
     arm = np.repeat([reference.arm_translation**2, reference.arm_rotation**2], 3)
     rails = np.full(stops, reference.rail**2)
     rails[[look.stop for look in every if look.sweeping]] += SWEEP_RAIL_M**2
-    own = arm if repeats is None else np.minimum(arm, np.repeat(np.square(repeats), 3))
+    own = np.minimum(arm, np.repeat(np.square(reference.repeats), 3))
     prior[np.arange(SHARED, size), np.arange(SHARED, size)] = np.concatenate([np.tile(own, rests), rails])
     prior[SHARED : size - stops, SHARED : size - stops] += np.kron(np.ones((rests, rests)), np.diag(arm - own))
     kinds: dict[str, list[tuple[Array, Array]]] = {"dots": [], "stripe": [], "before": []}

@@ -251,11 +251,11 @@ class HeadShift:
     @classmethod
     def of(
         cls, state: AdjustmentState, reference: Reference, looks: Sequence[PictureMeasurements],
-        repeats: tuple[float, float], then: InterimPicture | None = None,
+        then: InterimPicture | None = None,
     ) -> Self:  # fmt: skip
         """From pictures of the board, each from a rest of its own in one posture, beside the calibrated `state`.
 
-        `repeats` (m, rad) is the arm's repeatability, one standard deviation an axis, `then` the calibration's picture.
+        `then` is the calibration's own picture.
 
         A head that slipped is shifted or turned, seldom both, so each is held against chance by itself.
         """
@@ -263,7 +263,7 @@ class HeadShift:
         if then is not None:
             own = 1 + max(look.rest for look in looks), 1 + max(look.stop for look in looks)
             before = [PictureMeasurements(then.measured(state, looks[0].data), *own)]
-        weighed = evidence(state, reference, looks, repeats, before)
+        weighed = evidence(state, reference, looks, before)
         hand = np.eye(SHARED)[:, HAND]
         change, covariance = weighed.change(hand)
         score, information = hand.T @ weighed.score, hand.T @ weighed.information @ hand

@@ -62,8 +62,7 @@ def look(cell: ObservedCell, calibration: CellCalibration, rests: int) -> HeadSh
         photo = cell.scan_view(rest, cell.carriage(view.rail_position))
         one = ScanObservation(photo, None, from_matrix(rest.reported), view.rail_position)
         seen.append(PictureMeasurements(dots_of(one), k, k))
-    repeats = (CONFIG.arm.repeatability, CONFIG.arm.repeatability_angle)
-    return HeadShift.of(scan.state(scan.reference.base_from_board), scan.reference, seen, repeats, scan.interim)
+    return HeadShift.of(scan.state(scan.reference.base_from_board), scan.reference, seen, scan.interim)
 
 
 def test_a_head_that_nobody_touched_is_as_uncertain_as_it_is_said(calibrated: Calibrated):
