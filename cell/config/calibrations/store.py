@@ -17,7 +17,6 @@ from cell.base.storage import read_json, require_date, sealed, write_json
 from cell.config.cell_config import CellConfig
 from cell.measure.calibration import Priors, ScanCalibration, ScanObservation, TargetCalibration, TargetObservation
 from cell.measure.calibration.archive import SUFFIX, Observations
-from cell.measure.calibration.drift.evidence import INTERIM_VIEW, InterimPicture
 from cell.measure.calibration.drift.reference_plate import PlateLine
 from cell.measure.calibration.drift.timing import StampTiming
 from cell.measure.calibration.judge.faults import SCALE_RANGE, refuse_wrong_lead
@@ -25,7 +24,6 @@ from cell.measure.calibration.solve.joint import Joint
 from cell.measure.calibration.solve.results import Quality, adjust_scan, adjust_target, sigmas
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.light_plane import LightPlane
-from cell.measure.vision.board.board import board_pose
 from drivers.errors import CalibrationStale, ConfigError
 from drivers.make import CameraConfig, DeviceConfig, RailConfig
 
@@ -59,6 +57,9 @@ def require_valid(calibration: "CellCalibration") -> None:
             _require(f"{name}.reference.base_from_board, m", kept.base_from_board.translation, -10.0, 10.0)
             sigma = kept.arm_translation, kept.arm_rotation, kept.rail, kept.dots_scale, kept.stripe_scale
             _require(f"{name}.reference, sigma and scale", sigma, 0.0, 1e3)
+            for view, seen in kept.pictures.items():
+                there = *seen.base_from_flange.translation, *seen.camera_from_board.translation, seen.rail
+                _require(f"{name}.reference.pictures, {view}, m", there, -10.0, 10.0)
     require_covariance("scan.covariance", scan.covariance, LENS)
     require_covariance("target.hand_eye_covariance", target.hand_eye_covariance, range(0))
     _require("scan.light_plane, distance in m and bow", (scan.light_plane.distance, scan.light_plane.bow), -10.0, 10.0)
@@ -68,9 +69,6 @@ def require_valid(calibration: "CellCalibration") -> None:
     if (witness := scan.witness) is not None:
         _require("scan.witness.rail, m", witness.rail, -10.0, 10.0)
         _require("scan.witness.sigma, px", witness.sigma[witness.rows], 1e-9, 1e3)
-    if (seen := scan.interim) is not None:
-        there = *seen.base_from_flange.translation, *seen.camera_from_board.translation, seen.rail
-        _require("scan.interim, places in m", there, -10.0, 10.0)
 
 
 def require_covariance(name: str, covariance: Array, fixed: range) -> None:
@@ -261,17 +259,17 @@ def solve_observations(observations: Observations) -> Solved:
     o = observations
     scan = adjust_scan(o.scan, o.scan_camera, np.array([1.0, 0.0, 0.0]), o.priors)
     head = replace(ScanCalibration.of(scan), witness=o.witness)
-    for seen in o.scan:
-        if seen.name == f"fine {INTERIM_VIEW}" and seen.view is not None:
-            shown = board_pose(seen.view, head.camera).camera_from_board
-            head = replace(head, interim=InterimPicture(seen.base_from_flange, seen.rail_position, shown))
+    assert head.reference is not None
+    head = replace(head, reference=head.reference.with_pictures(o.scan, head.camera))
     refuse_wrong_lead(head.rail_direction, o.rail_lead)
     target = adjust_target(o.target, o.target_camera, o.priors)
     if target.size is not None:
         head = replace(head, notes=(*head.notes, *target.size.notes))
-    made = CellCalibration(
-        head, TargetCalibration.of(target), o.identities, o.configuration, made=o.made, kinematics=o.kinematics
-    )
+    eye = TargetCalibration.of(target)
+    assert eye.reference is not None
+    alike = [ScanObservation(one.view, None, one.base_from_flange, 0.0, one.name) for one in o.target]
+    eye = replace(eye, reference=eye.reference.with_pictures(alike, eye.camera))
+    made = CellCalibration(head, eye, o.identities, o.configuration, made=o.made, kinematics=o.kinematics)
     return Solved(made, scan, target)
 
 

@@ -16,7 +16,7 @@ import scipy
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job, PhotoSection
 from cell.measure.calibration import ScanCalibration, TargetCalibration
-from cell.measure.calibration.drift.evidence import INTERIM_VIEW, Reference
+from cell.measure.calibration.drift.evidence import CHECKED_LARGE_VIEW, CHECKED_VIEW, INTERIM_VIEW, Reference
 from cell.measure.geometry.poses import compose_covariance, from_parts, from_ur, mean, transform
 from cell.measure.inversion.effects.during_sweep import require_firm, roll_of
 from cell.measure.vision.board.board import BoardPose, board_pose, find_board
@@ -301,17 +301,19 @@ def references(scan: ScanCalibration, target: TargetCalibration) -> tuple[Refere
 def verification_views(
     config: CellConfig, fine: BoardSpec, large: BoardSpec, scan: ScanCalibration, target: TargetCalibration
 ) -> tuple[CalibrationView, CalibrationView]:
-    """One of the scan camera's calibration views and one of the target camera's, aimed with what the calibration found.
+    """One of the scan camera's calibration views and one of the target camera's.
 
-    From the drawn poses a board may lie half out of the picture. The rail stands near its middle, so that it can move
-    both ways. Raises `CalibrationStale` for a calibration that was stored without its reference.
+    The first is aimed with what the calibration found: as drawn the board may lie half out of the picture. The rail
+    stands near its middle, so that it can move both ways. For the second the arm stands where it stood. Raises
+    `CalibrationStale` for a calibration that was stored without its reference.
     """
     near, far = references(scan, target)
-    base_from_target = _looking(far.base_from_board, large, _TARGET_VIEWS[TARGET_VERIFICATION])
-    return (
-        _scan_view(config, fine, scan, near, SCAN_VERIFICATION),
-        CalibrationView(base_from_target * target.flange_from_camera.inverse(), 0.0),
-    )
+    if (known := far.pictures.get(CHECKED_LARGE_VIEW)) is not None:
+        eye = CalibrationView(known.base_from_flange, 0.0)
+    else:
+        base_from_target = _looking(far.base_from_board, large, _TARGET_VIEWS[_numbered(CHECKED_LARGE_VIEW)])
+        eye = CalibrationView(base_from_target * target.flange_from_camera.inverse(), 0.0)
+    return _scan_view(config, fine, scan, near, CHECKED_VIEW), eye
 
 
 def interim_view(config: CellConfig, fine: BoardSpec, scan: ScanCalibration) -> CalibrationView:
@@ -323,22 +325,26 @@ def interim_view(config: CellConfig, fine: BoardSpec, scan: ScanCalibration) -> 
     """
     if scan.reference is None:
         raise CalibrationStale(NO_REFERENCE)
-    if scan.interim is not None:
-        return CalibrationView(scan.interim.base_from_flange, scan.interim.rail)
-    return _scan_view(config, fine, scan, scan.reference, SCAN_INTERIM)
+    return _scan_view(config, fine, scan, scan.reference, INTERIM_VIEW)
 
 
 def drawn_interim_view(config: CellConfig) -> CalibrationView:
     """The same as drawn, for who has no calibration at hand."""
-    return scan_calibration_views(config, parse_board(config.calibration.fine.board))[SCAN_INTERIM]
+    return scan_calibration_views(config, parse_board(config.calibration.fine.board))[_numbered(INTERIM_VIEW)]
 
 
 def _scan_view(
-    config: CellConfig, fine: BoardSpec, scan: ScanCalibration, near: Reference, k: int
+    config: CellConfig, fine: BoardSpec, scan: ScanCalibration, near: Reference, view: str
 ) -> CalibrationView:  # fmt: skip
-    rail = _scan_rail(config, k)
+    if (known := near.pictures.get(view)) is not None:
+        return CalibrationView(known.base_from_flange, known.rail)
+    rail = _scan_rail(config, k := _numbered(view))
     base_from_scan = _looking(near.base_from_board, fine, _SCAN_VIEWS[k])
     return CalibrationView(base_from_scan * scan.flange_from_camera_at(rail).inverse(), rail)
+
+
+def _numbered(view: str) -> int:
+    return int(view.split()[1]) - 1
 
 
 def rail_ends(
@@ -392,7 +398,6 @@ def _looking(base_from_board: pin.SE3, board: BoardSpec, drawn: Sequence[float])
     return centre * from_parts(np.zeros(3), rotation) * from_parts(1e-3 * np.array([along, across, -depth]))
 
 
-SCAN_VERIFICATION, SCAN_INTERIM, TARGET_VERIFICATION = 6, INTERIM_VIEW - 1, 5
 EDGE_PX, LEAST_DOTS, RAIL_STEP, LEAST_WAY = 12.0, 0.5, 1e-3, 0.02
 
 # Offset of the optical axis along and across the board in mm, depth in mm, tilts about x and y and turn about z in deg.

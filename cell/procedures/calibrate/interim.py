@@ -66,7 +66,7 @@ class InterimCheck:
         if near is None:
             raise CalibrationStale(NO_REFERENCE)
         seen = [PictureMeasurements(dots_of(look), k, k) for k, look in enumerate(looks)]
-        head = HeadShift.of(scan.state(near.base_from_board), near, seen, scan.interim)
+        head = HeadShift.of(scan.state(near.base_from_board), near, seen)
         does = at_place(calibration, job, middle)
         effects = [does("scan", change) for change in head.drawn(DRAWS)]
         seen_at = middle * scan.rail_direction + np.array([0.0, 0.0, job.scan.stand_off])

@@ -29,7 +29,13 @@ from cell.measure.calibration.drift.decision import (
     target_effect,
     verdict,
 )
-from cell.measure.calibration.drift.evidence import PictureMeasurements, dots_of, evidence
+from cell.measure.calibration.drift.evidence import (
+    CHECKED_LARGE_VIEW,
+    CHECKED_VIEW,
+    PictureMeasurements,
+    dots_of,
+    evidence,
+)
 from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, Pointing, turn_seen
 from cell.measure.calibration.drift.slip import WitnessCheck
 from cell.measure.calibration.solve.joint import STRIPE_POINTS
@@ -91,8 +97,8 @@ def verify(scan: ScanCalibration, target: TargetCalibration, seen: CheckObservat
     near, far = references(scan, target)
     head, eye = scan.state(near.base_from_board), target.state(far.base_from_board)
     evidences = {
-        "scan": evidence(head, near, scan_looks(head, seen)),
-        "target": evidence(eye, far, target_looks(seen.target)),
+        "scan": evidence(head, near, scan_looks(head, seen), CHECKED_VIEW),
+        "target": evidence(eye, far, target_looks(seen.target), CHECKED_LARGE_VIEW),
     }
     return verdict(evidences, {"scan": head, "target": eye})
 
@@ -102,7 +108,7 @@ def check_witness(scan: ScanCalibration, seen: CheckObservations) -> WitnessChec
     if seen.pointing is None or scan.reference is None:
         return None
     state = scan.state(scan.reference.base_from_board)
-    weighed = evidence(state, scan.reference, scan_looks(state, seen))
+    weighed = evidence(state, scan.reference, scan_looks(state, seen), CHECKED_VIEW)
     return WitnessCheck.of(seen.pointing, seen.exit_point, state, weighed)
 
 

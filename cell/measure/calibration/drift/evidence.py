@@ -5,8 +5,8 @@ is taken out; what is left speaks for a change. A hypothesis is a Gaussian chang
 parameters of one camera's chain, against none. A calibration leaves a `Reference` behind to be verified by.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -32,73 +32,20 @@ from cell.measure.calibration.solve.normal import (
     dots_block,
     stripe_block,
 )
-from cell.measure.geometry.camera import Array
+from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.poses import from_matrix, from_parts
+from cell.measure.vision.board.board import board_pose
+
+INTERIM_VIEW, CHECKED_VIEW, CHECKED_LARGE_VIEW = "fine 17", "fine 7", "large 6"
+"""The views of a calibration from which each job looks again, and a verification, by its scan and its target camera.
+
+From the second one the rail moves far either way: it is aimed anew, and has no picture to compare with.
+"""
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
-    """The board in the arm's base, and the covariance (27, 27) of everything that the calibration estimated.
-
-    The covariance is in the order of `cell.measure.calibration.solve.normal` (camera, light plane, rail, hand-eye,
-    board), zero where nothing was estimated, and allows for the scatter that was found. `arm_translation` (m),
-    `arm_rotation` (rad) and `rail` (m) are the standard deviations per axis of a flange pose and of a rail reading: as
-    configured, or as found where that was more. `repeats` (m, rad) is how well the arm comes back to one posture; files
-    of older programs have none. `dots_scale` and `stripe_scale` multiply the stated σ of dots and stripe.
-    """
-
-    base_from_board: pin.SE3
-    covariance: Array
-    arm_translation: float
-    arm_rotation: float
-    rail: float
-    dots_scale: float
-    stripe_scale: float
-    repeats: tuple[float, float] = (np.inf, np.inf)
-
-    @classmethod
-    def of(cls, adjusted: Adjusted) -> Self:
-        """Of a joint adjustment."""
-        excess = {name: max(1.0, adjusted.excess.get(name, 1.0)) for name in ("shift", "turn", "rail")}
-        priors = adjusted.priors
-        return cls(
-            adjusted.state.base_from_board, adjusted.reliable_covariance, priors.arm_translation * excess["shift"],
-            arm_rotation=priors.arm_rotation * excess["turn"], rail=priors.rail * excess["rail"],
-            dots_scale=priors.dots_scale, stripe_scale=priors.stripe_scale,
-            repeats=(priors.arm_translation, priors.arm_rotation),
-        )  # fmt: skip
-
-    def as_dict(self) -> dict[str, object]:
-        """For storage."""
-        return {
-            "base_from_board": self.base_from_board.homogeneous.tolist(),
-            "covariance": self.covariance.tolist(),
-            "sigma": {"arm_translation": self.arm_translation, "arm_rotation": self.arm_rotation, "rail": self.rail},
-            "scale": {"dots": self.dots_scale, "stripe": self.stripe_scale},
-            **({"repeats": list(self.repeats)} if np.isfinite(self.repeats).all() else {}),
-        }
-
-    @classmethod
-    def read(cls, data: dict[str, Any] | None) -> Self | None:
-        """From storage, None for None; KeyError, TypeError or ValueError when it is not one."""
-        if data is None:
-            return None
-        sigma, scale, (shift, turn) = data["sigma"], data["scale"], data.get("repeats", (np.inf, np.inf))
-        return cls(
-            from_matrix(data["base_from_board"]),
-            np.array(data["covariance"], dtype=np.float64).reshape(SHARED, SHARED), float(sigma["arm_translation"]),
-            arm_rotation=float(sigma["arm_rotation"]), rail=float(sigma["rail"]), dots_scale=float(scale["dots"]),
-            stripe_scale=float(scale["stripe"]), repeats=(float(shift), float(turn)),
-        )  # fmt: skip
-
-
-INTERIM_VIEW = 17
-"""Which of the scan camera's calibration views, from 1, each job looks from again."""
-
-
-@dataclass(frozen=True, eq=False)
-class InterimPicture:
-    """The calibration's own picture of the fine board, from where each job looks at it again.
+class KnownPicture:
+    """The calibration's own picture of a board, from where it is looked at again.
 
     `base_from_flange` and `rail` (m) are as reported then, `camera_from_board` is where that picture alone has the
     board.
@@ -124,6 +71,74 @@ class InterimPicture:
         there = replace(state, base_from_board=camera * self.camera_from_board)
         off, _ = dots_block(there, like, self.base_from_flange, self.rail)
         return replace(like, pixels=like.pixels - off, base_from_flange=self.base_from_flange, rail=self.rail)
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """The board in the arm's base, and the covariance (27, 27) of everything that the calibration estimated.
+
+    The covariance is in the order of `cell.measure.calibration.solve.normal` (camera, light plane, rail, hand-eye,
+    board), zero where nothing was estimated, and allows for the scatter that was found. `arm_translation` (m),
+    `arm_rotation` (rad) and `rail` (m) are the standard deviations per axis of a flange pose and of a rail reading: as
+    configured, or as found where that was more. `repeats` (m, rad) is how well the arm comes back to one posture; files
+    of older programs have none. `dots_scale` and `stripe_scale` multiply the stated σ of dots and stripe. `pictures`
+    are those of the views from which the board is looked at again.
+    """
+
+    base_from_board: pin.SE3
+    covariance: Array
+    arm_translation: float
+    arm_rotation: float
+    rail: float
+    dots_scale: float
+    stripe_scale: float
+    repeats: tuple[float, float] = (np.inf, np.inf)
+    pictures: Mapping[str, KnownPicture] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, adjusted: Adjusted) -> Self:
+        """Of a joint adjustment."""
+        excess = {name: max(1.0, adjusted.excess.get(name, 1.0)) for name in ("shift", "turn", "rail")}
+        priors = adjusted.priors
+        return cls(
+            adjusted.state.base_from_board, adjusted.reliable_covariance, priors.arm_translation * excess["shift"],
+            arm_rotation=priors.arm_rotation * excess["turn"], rail=priors.rail * excess["rail"],
+            dots_scale=priors.dots_scale, stripe_scale=priors.stripe_scale,
+            repeats=(priors.arm_translation, priors.arm_rotation),
+        )  # fmt: skip
+
+    def as_dict(self) -> dict[str, object]:
+        """For storage."""
+        return {
+            "base_from_board": self.base_from_board.homogeneous.tolist(),
+            "covariance": self.covariance.tolist(),
+            "sigma": {"arm_translation": self.arm_translation, "arm_rotation": self.arm_rotation, "rail": self.rail},
+            "scale": {"dots": self.dots_scale, "stripe": self.stripe_scale},
+            **({"repeats": list(self.repeats)} if np.isfinite(self.repeats).all() else {}),
+            "pictures": {view: picture.as_dict() for view, picture in self.pictures.items()},
+        }
+
+    @classmethod
+    def read(cls, data: dict[str, Any] | None) -> Self | None:
+        """From storage, None for None; KeyError, TypeError or ValueError when it is not one."""
+        if data is None:
+            return None
+        sigma, scale, (shift, turn) = data["sigma"], data["scale"], data.get("repeats", (np.inf, np.inf))
+        return cls(
+            from_matrix(data["base_from_board"]),
+            np.array(data["covariance"], dtype=np.float64).reshape(SHARED, SHARED), float(sigma["arm_translation"]),
+            arm_rotation=float(sigma["arm_rotation"]), rail=float(sigma["rail"]), dots_scale=float(scale["dots"]),
+            stripe_scale=float(scale["stripe"]), repeats=(float(shift), float(turn)),
+            pictures={view: KnownPicture.read(**picture) for view, picture in data.get("pictures", {}).items()},
+        )  # fmt: skip
+
+    def with_pictures(self, observations: Sequence[ScanObservation], camera: CameraModel) -> Self:
+        """With the pictures of the calibration's `observations` from where the board is looked at again."""
+        again = [o for o in observations if o.name in (INTERIM_VIEW, CHECKED_LARGE_VIEW)]
+        return replace(self, pictures={
+            o.name: KnownPicture(o.base_from_flange, o.rail_position, board_pose(o.view, camera).camera_from_board)
+            for o in again if o.view is not None
+        })  # fmt: skip
 
 
 # The lens model itself is no better than this; it keeps few-thousandths noise from making a test of the model.
@@ -170,18 +185,21 @@ class DriftEvidence:
 
 
 def evidence(
-    state: AdjustmentState, reference: Reference, looks: Sequence[PictureMeasurements],
-    before: Sequence[PictureMeasurements] = (),
-) -> DriftEvidence:  # fmt: skip
-    """Weigh observations in one posture of the arm against a calibration with its values and the board in `state`.
+    state: AdjustmentState, reference: Reference, looks: Sequence[PictureMeasurements], name: str
+) -> DriftEvidence:
+    """Weigh looks from the calibration's view of that `name` against it; its values and the board are in `state`.
 
     With residual r, derivative J of all parameters q and their prior covariance Σ the misfit's covariance is
     S = R + JΣJᵀ. A change shows in the rows D of J that are of `looks`. With H = JᵀR⁻¹J, g = JᵀR⁻¹r and C = DᵀR⁻¹J the
     score DᵀS⁻¹r is DᵀR⁻¹r − CΣ(I + HΣ)⁻¹g, the information DᵀS⁻¹D is DᵀR⁻¹D − CΣ(I + HΣ)⁻¹Cᵀ (matrix inversion lemma).
 
-    What the arm scatters beyond its repeatability is the posture's own, the same at each rest. Pictures from `before`
-    the change show how large that is.
+    What the arm scatters beyond its repeatability is the posture's own, the same at each rest. The calibration's own
+    picture from there shows how large that is.
     """
+    before = []
+    if (known := reference.pictures.get(name)) is not None:
+        rest, stop = 1 + max(look.rest for look in looks), 1 + max(look.stop for look in looks)
+        before = [PictureMeasurements(known.measured(state, looks[0].data), rest, stop)]
     every = [*looks, *before]
     rests = 1 + max(look.rest for look in every)
     stops = 1 + max(look.stop for look in every)

@@ -17,8 +17,8 @@ import scipy
 
 from cell.measure.calibration.drift.decision import WORST_FIT
 from cell.measure.calibration.drift.evidence import (
+    INTERIM_VIEW,
     DriftEvidence,
-    InterimPicture,
     PictureMeasurements,
     Reference,
     evidence,
@@ -249,21 +249,12 @@ class HeadShift:
     looks: int
 
     @classmethod
-    def of(
-        cls, state: AdjustmentState, reference: Reference, looks: Sequence[PictureMeasurements],
-        then: InterimPicture | None = None,
-    ) -> Self:  # fmt: skip
-        """From pictures of the board, each from a rest of its own in one posture, beside the calibrated `state`.
-
-        `then` is the calibration's own picture.
+    def of(cls, state: AdjustmentState, reference: Reference, looks: Sequence[PictureMeasurements]) -> Self:
+        """From pictures of the board, each from a rest of its own in `INTERIM_VIEW`, beside the calibrated `state`.
 
         A head that slipped is shifted or turned, seldom both, so each is held against chance by itself.
         """
-        before = []
-        if then is not None:
-            own = 1 + max(look.rest for look in looks), 1 + max(look.stop for look in looks)
-            before = [PictureMeasurements(then.measured(state, looks[0].data), *own)]
-        weighed = evidence(state, reference, looks, before)
+        weighed = evidence(state, reference, looks, INTERIM_VIEW)
         hand = np.eye(SHARED)[:, HAND]
         change, covariance = weighed.change(hand)
         score, information = hand.T @ weighed.score, hand.T @ weighed.information @ hand

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.measure.calibration.archive import ScanObservation, TargetObservation
-from cell.measure.calibration.drift.evidence import InterimPicture, Reference
+from cell.measure.calibration.drift.evidence import Reference
 from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, PlateLine, Pointing, rolled, turned
 from cell.measure.calibration.drift.timing import Shutter, StampTiming
 from cell.measure.calibration.judge.checks import joint_checks
@@ -69,8 +69,7 @@ class ScanCalibration:
     usual. With a `pointing` the light plane is the one that the `witness` showed later, turned about `exit_point` (3,),
     m, in the camera's frame. `confirmed` is what a verification found out about the laser since, `timing` how late the
     camera's time stamps were found to come, `shutter` how its rows are exposed; `unread` says what of these a file held
-    that cannot be read, `refused` why a later look at the camera's times was refused, "" if none was. `interim` is the
-    picture that jobs compare with before they go on; files of older programs have none.
+    that cannot be read, `refused` why a later look at the camera's times was refused, "" if none was.
     """
 
     camera: CameraModel
@@ -91,7 +90,6 @@ class ScanCalibration:
     shutter: Shutter | None = None
     unread: tuple[str, ...] = ()
     refused: str = ""
-    interim: InterimPicture | None = None
 
     @classmethod
     def of(cls, joint: Joint) -> Self:
@@ -169,7 +167,6 @@ class ScanCalibration:
             "reference": None if self.reference is None else self.reference.as_dict(),
             "notes": list(self.notes),
             "witness": None if self.witness is None else self.witness.as_dict(),
-            "interim": None if self.interim is None else self.interim.as_dict(),
         }
 
     @classmethod
@@ -201,7 +198,6 @@ class ScanCalibration:
             bow_gain=np.array(plane["bow_gain"], dtype=np.float64).reshape(KEPT),
             notes=tuple(data["notes"]), witness=PlateLine.read(data["witness"]), confirmed=confirmed,
             timing=timing, shutter=shutter, unread=tuple(unread), refused=str(data.get("refused", "")),
-            interim=InterimPicture.read(**data["interim"]) if data.get("interim") else None,
         )  # fmt: skip
 
 

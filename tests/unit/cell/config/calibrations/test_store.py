@@ -22,7 +22,6 @@ from cell.config.calibrations.store import (
 from cell.config.cell_config import load_config
 from cell.measure.calibration import ScanCalibration, TargetCalibration
 from cell.measure.calibration.archive import _pose
-from cell.measure.calibration.drift.evidence import InterimPicture
 from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, PlateLine
 from cell.measure.calibration.solve.results import KEPT, Quality
 from cell.measure.geometry.light_plane import LightPlane
@@ -126,7 +125,6 @@ ROWS[100:200] = 300.0
         (_scan(flange_from_camera=pin.SE3(np.eye(3), np.array([90.0, 0, 0]))), "flange_from_camera, m: 90"),
         (_scan(confirmed=ConfirmedTurn(0.0, 0.0, 1e-5, 4.07e9)), "confirmed.made lies .* hours in the future"),
         (_scan(witness=PlateLine(0.0, ROWS, 0.0 * ROWS)), r"witness\.sigma"),
-        (_scan(interim=InterimPicture(pin.SE3.Identity(), 90.0, pin.SE3.Identity())), "interim, places in m: 90"),
         (replace(made(), target=replace(made().target, hand_eye_covariance=np.zeros((6, 6)))), "hand_eye_covariance"),
         (replace(made(), made=4.07e9), "hours in the future"),
         (replace(made(), made=0.0), "no date"),

@@ -11,6 +11,7 @@ from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig, load_config
 from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
+from cell.measure.calibration.drift.evidence import INTERIM_VIEW
 from cell.measure.calibration.drift.slip import HeadShift
 from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Mover
@@ -69,10 +70,12 @@ def test_a_cell_that_nobody_touched_passes_and_says_what_it_saw(
 
 def test_each_job_looks_from_where_the_calibration_looked(placed_pot: JobRecord):
     calibration = placed_pot.calibration
-    then, view = calibration.scan.interim, fine_board_view(CONFIG, calibration)
+    scan = calibration.scan
+    then, view = scan.reference.pictures[INTERIM_VIEW], fine_board_view(CONFIG, calibration)
     assert (view.base_from_flange, view.rail_position) == (then.base_from_flange, then.rail)
-    assert type(calibration.scan).from_dict(calibration.scan.as_dict()).interim.as_dict() == then.as_dict()
-    older = replace(calibration, scan=replace(calibration.scan, interim=None))
+    again = type(scan).from_dict(scan.as_dict()).reference
+    assert again.pictures[INTERIM_VIEW].as_dict() == then.as_dict() and again.repeats == scan.reference.repeats
+    older = replace(calibration, scan=replace(scan, reference=replace(scan.reference, pictures={})))
     aimed = fine_board_view(CONFIG, older).base_from_flange
     assert 1e-5 < np.linalg.norm(aimed.actInv(then.base_from_flange).translation) < 0.02
 

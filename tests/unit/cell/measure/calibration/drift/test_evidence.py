@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from cell.config.calibrations.store import CellCalibration, read_calibration, save_calibration
 from cell.config.cell_config import load_config
 from cell.measure.calibration.drift.decision import verdict
-from cell.measure.calibration.drift.evidence import Reference, evidence
+from cell.measure.calibration.drift.evidence import CHECKED_LARGE_VIEW, CHECKED_VIEW, Reference, evidence
 from cell.measure.calibration.solve.normal import BOARD, SHARED, AdjustmentState
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import covariance_root, from_matrix
@@ -71,8 +71,8 @@ def test_the_evidence_of_a_good_calibration_scatters_as_it_says(calibrated, chec
         )  # fmt: skip
         seen = look_again(quiet, made)
         evidences = {
-            "scan": evidence(scan, references["scan"], scan_looks(scan, seen)),
-            "target": evidence(target, references["target"], target_looks(seen.target)),
+            "scan": evidence(scan, references["scan"], scan_looks(scan, seen), CHECKED_VIEW),
+            "target": evidence(target, references["target"], target_looks(seen.target), CHECKED_LARGE_VIEW),
         }
         alarms += not verdict(evidences, states).good
         for weighed in evidences.values():

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import load_config
 from cell.measure.calibration import ScanObservation
-from cell.measure.calibration.drift.evidence import PictureMeasurements, dots_of
+from cell.measure.calibration.drift.evidence import INTERIM_VIEW, PictureMeasurements, dots_of
 from cell.measure.calibration.drift.slip import CHANCE, LARGEST_LAG_S, LARGEST_M, NOTED_M, SUSPICIOUS, HeadShift, Slip
 from cell.measure.calibration.solve.normal import HAND
 from cell.measure.geometry.poses import from_matrix
@@ -62,7 +62,7 @@ def look(cell: ObservedCell, calibration: CellCalibration, rests: int) -> HeadSh
         photo = cell.scan_view(rest, cell.carriage(view.rail_position))
         one = ScanObservation(photo, None, from_matrix(rest.reported), view.rail_position)
         seen.append(PictureMeasurements(dots_of(one), k, k))
-    return HeadShift.of(scan.state(scan.reference.base_from_board), scan.reference, seen, scan.interim)
+    return HeadShift.of(scan.state(scan.reference.base_from_board), scan.reference, seen)
 
 
 def test_a_head_that_nobody_touched_is_as_uncertain_as_it_is_said(calibrated: Calibrated):
@@ -98,10 +98,11 @@ def test_what_the_arm_errs_by_in_that_posture_is_no_change_of_the_head(calibrate
     cell, calibration = calibrated
     truth, off = cell.truth, shifted(np.array([0.25e-3, 0.0, 0.0]))
     scan = replace(calibration.scan, reference=replace(calibration.scan.reference, arm_translation=0.15e-3))
+    known = scan.reference.pictures[INTERIM_VIEW]
     monkeypatch.setattr(cell, "truth", replace(truth, base_from_fine=off @ truth.base_from_fine))
-    camera = scan.interim.base_from_flange * scan.flange_from_camera_at(scan.interim.rail)
-    then = camera.inverse() * from_matrix(off) * camera * scan.interim.camera_from_board
-    as_then = replace(scan, interim=replace(scan.interim, camera_from_board=then))
+    camera = known.base_from_flange * scan.flange_from_camera_at(known.rail)
+    known = replace(known, camera_from_board=camera.inverse() * from_matrix(off) * camera * known.camera_from_board)
+    as_then = replace(scan, reference=replace(scan.reference, pictures={INTERIM_VIEW: known}))
     assert look(cell, replace(calibration, scan=scan), 4).changed
     assert not look(cell, replace(calibration, scan=as_then), 4).changed
 
