@@ -323,19 +323,17 @@ class Job(Table):
 
     def _twice_there(self) -> str | None:
         """Which item would put a part where one lies already, or take one from where none is left."""
-        known: list[tuple[str, pin.SE3, bool, int]] = []
+        known: list[tuple[str, pin.SE3, bool]] = []
         for k, item in enumerate(self.item, 1):
-            nest = (item.base_from_part or self.nest.base_from_part).se3() if self.nest else pin.SE3.Identity()
+            assert self.nest is not None
+            nest = (item.base_from_part or self.nest.base_from_part).se3()
             place = (item.place_from_surface or self.surface.place_from_surface).se3()
-            loads = item.kind == "load"
-            for where, pose, full in (("its nest", nest, not loads), (f"its place {item.stop or ''}", place, loads)):
-                same = [one for one in known if one[0] == where and one[1].isApprox(pose, 1e-6)]
-                if same and same[-1][2] is full:
-                    what = (
-                        f"already has the part of item {same[-1][3]}" if full else f"is empty after item {same[-1][3]}"
-                    )
-                    return f"item {k}: {where.strip()} {what}; give it another one, or another order"
-                known.append((where, pose, full, k))
+            for where, pose, full in (("nest", nest, item.kind == "unload"), ("place", place, item.kind == "load")):
+                where = f"{where} at {item.stop}" if where == "place" and item.stop else where
+                same = [was for at, was_at, was in known if at == where and was_at.isApprox(pose, 1e-6)]
+                if same and same[-1] is full:
+                    return f"item {k}: after those before it its {where} {'has a part' if full else 'is empty'} already"
+                known.append((where, pose, full))
         return None
 
     def _stop_problem(self) -> str | None:

@@ -18,13 +18,8 @@ from drivers.interfaces import Arm, Camera, Claw, Device, Laser, LinkTable, Rail
 from drivers.make import OnArm, Surroundings
 
 INTERFACES: dict[str, type] = {
-    "rail": Rail,
-    "arm": Arm,
-    "vehicle": Vehicle,
-    "camera": Camera,
-    "laser": Laser,
-    "claw": Claw,
-}
+    "rail": Rail, "arm": Arm, "vehicle": Vehicle, "camera": Camera, "laser": Laser, "claw": Claw,
+}  # fmt: skip
 """What each kind of device has to offer, whatever its make."""
 
 

@@ -4,6 +4,7 @@ A subscriber that does not keep up loses only progress: of each step it then fin
 kept for it up to a bound; the journal has everything.
 """
 
+import inspect
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -126,36 +127,27 @@ class RunEnded(RunEvent):
     reason: str
 
 
+TYPED: Mapping[str, Callable[..., RunEvent]] = {
+    "step_started": StepStarted, "progress": StepProgress, "step_failed": StepFailed, "fault": FaultMet,
+    "safe_stop": SafeStopped, "confirm_needed": ConfirmNeeded, "confirmed": Confirmed, "paused": Held,
+    "going_on": GoesOn, "run_ended": RunEnded,
+}  # fmt: skip
+"""Of each kind of the runner's events, its class: the data go by the names of its fields."""
+
+
 def typed(event: Event) -> RunEvent:
     """The typed form of an event of the runner."""
     at, step, data = event.at, event.step, dict(event.data)
     match event.kind:
         case "state":
             return StateChanged(at, step, str(data["trigger"]), str(data["from"]), str(data["to"]))
-        case "step_started":
-            return StepStarted(at, step, int(str(data["attempt"])))
-        case "progress":
-            return StepProgress(at, step, float(str(data["fraction"])), str(data["text"]))
         case "step_done":
             return StepDone(at, step, float(str(data.pop("duration_s"))), data)
-        case "step_failed":
-            return StepFailed(at, step, int(str(data["attempt"])), str(data["reason"]))
         case "fault":
-            return FaultMet(at, step, str(data["code"]), str(data["reason"]), str(data.get("remedy", "noted")))
-        case "safe_stop":
-            trouble = data["trouble"]
-            return SafeStopped(at, step, str(data["reason"]), None if trouble is None else str(trouble))
-        case "confirm_needed":
-            return ConfirmNeeded(at, step, str(data["reason"]), str(data["code"]), int(str(data["number"])))
-        case "confirmed":
-            return Confirmed(at, step, str(data["by"]), str(data["reason"]))
-        case "paused":
-            return Held(at, step, str(data["text"]))
-        case "going_on":
-            return GoesOn(at, step, str(data["text"]))
-        case "run_ended":
-            return RunEnded(at, step, str(data["outcome"]), str(data["reason"]))
-    return Noted(at, step, data)
+            data.setdefault("remedy", "noted")
+    if (made := TYPED.get(event.kind)) is None:
+        return Noted(at, step, data)
+    return made(at, step, **{name: data[name] for name in list(inspect.signature(made).parameters)[2:]})
 
 
 class Subscription:

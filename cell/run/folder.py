@@ -202,12 +202,10 @@ def _from_journal(folder: Path) -> dict[str, Any]:
     for row in record.steps:
         before = steps.get(row.name, {"duration_s": 0.0, "wall_s": 0.0, "retries": -1})
         steps[row.name] = {
-            "name": row.name,
-            "state": row.state,
-            "duration_s": before["duration_s"] + (row.duration_s or 0.0),
+            "name": row.name, "state": row.state, "duration_s": before["duration_s"] + (row.duration_s or 0.0),
             "wall_s": before["wall_s"] + max(0.0, (row.ended or row.started) - row.started),
             "retries": before["retries"] + 1,
-        }
+        }  # fmt: skip
     return {
         "run": folder.name, "kind": "job", "outcome": run.outcome or "not ended", "reason": run.reason or going,
         "started": when(run.started), "ended": None if run.ended is None else when(run.ended),

@@ -421,21 +421,16 @@ def _poses(world: World, t: float) -> dict[str, Pose]:
     base_from_flange = world.arm.base_from_flange(t)
     world_from_part = world.part.part_pose(world_from_base @ base_from_flange)
     return {
-        "world_from_vehicle": world.vehicle.world_from_vehicle(t),
-        "world_from_base": world_from_base,
-        "world_from_surface": scene.world_from_surface,
-        "world_from_board": scene.world_from_board,
+        "world_from_vehicle": world.vehicle.world_from_vehicle(t), "world_from_base": world_from_base,
+        "world_from_surface": scene.world_from_surface, "world_from_board": scene.world_from_board,
         "base_from_surface": base_from_world @ scene.world_from_surface,
-        "base_from_board": base_from_world @ scene.world_from_board,
-        "base_from_flange": base_from_flange,
-        "base_from_fine_board": scene.base_from_fine_board,
-        "base_from_deck_board": scene.base_from_deck_board,
+        "base_from_board": base_from_world @ scene.world_from_board, "base_from_flange": base_from_flange,
+        "base_from_fine_board": scene.base_from_fine_board, "base_from_deck_board": scene.base_from_deck_board,
         "flange_from_scan_camera": scene.flange_from_scan_camera,
-        "flange_from_target_camera": scene.flange_from_target_camera,
-        "flange_from_part": scene.flange_from_part,
+        "flange_from_target_camera": scene.flange_from_target_camera, "flange_from_part": scene.flange_from_part,
         "base_from_part": base_from_world @ world_from_part,
         "surface_from_part": inverse(scene.world_from_surface) @ world_from_part,
-    }
+    }  # fmt: skip
 
 
 def _nested(values: Pose) -> Any:

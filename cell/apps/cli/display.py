@@ -235,13 +235,8 @@ def _cut(text: str, width: int) -> str:
 
 
 COLOURS = {
-    "placed": "green",
-    "done": "green",
-    "refused": "yellow",
-    "misplaced": "red",
-    "faulted": "red",
-    "aborted": "magenta",
-}
+    "placed": "green", "done": "green", "refused": "yellow", "misplaced": "red", "faulted": "red", "aborted": "magenta",
+}  # fmt: skip
 
 
 def print_report(report: Mapping[str, Any], folder: str, *, noise: bool = False, whole: bool = False) -> None:

@@ -97,12 +97,9 @@ class Result:
     def as_dict(self) -> dict[str, object]:
         """JSON-ready."""
         return {
-            "verdict": self.verdict.value,
-            "readings": [{**asdict(row), "ok": row.ok} for row in self.readings],
-            "findings": [asdict(finding) for finding in self.findings],
-            "notes": self.notes,
-            "pictures": self.pictures,
-        }
+            "verdict": self.verdict.value, "readings": [{**asdict(row), "ok": row.ok} for row in self.readings],
+            "findings": [asdict(finding) for finding in self.findings], "notes": self.notes, "pictures": self.pictures,
+        }  # fmt: skip
 
 
 class CommissionCheck(NamedTuple):

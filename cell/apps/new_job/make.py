@@ -51,7 +51,6 @@ class Made(NamedTuple):
     job: Path
     mesh: Path
     picture: Path
-    name: str
     seen: float
     place: PlacePose
     notes: tuple[str, ...]
@@ -69,11 +68,8 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
     name = job_name(asker, mesh)
     targets = folder / f"{name}.toml", _beside(folder / f"{name}.stl", mesh), folder / f"{name}.png"
     part = _part(asker, folder, name)
-    for given in (mesh, *([] if part is None else [part.given])):
-        for target in (*targets, *([] if part is None or part.same else [part.target])):
-            if target.exists() and target.samefile(given):
-                raise ConfigError(f"{target} is a mesh that was given, and would be overwritten; take another --name")
-    _require_room(asker, targets if part is None or part.same else (*targets, part.target), overwrite)
+    written = targets[:2] if part is None or part.same else (*targets[:2], part.target)
+    _require_room(asker, (*written, targets[2]), overwrite, given=[mesh] if part is None else [mesh, part.given])
     like, _ = asker.get("like", "A job at the same station (its way, photograph and speeds)", "pot", load_job)
     job = _with_part(asker, station(asker, like, name, targets[1].name, laid), part)
     step = asker.get("step", "Lines of the scan, how far apart", "0.5 mm", lambda t: parse_quantity(t, "mm", *STEP_MM))
@@ -103,12 +99,12 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
         asker.notify(f"picture: {targets[2]}; look at it")
         if asker.ask is not None and asker.get("write", "Write the job", "yes", choice("yes", "no")) == "no":
             raise CellError(f"not written, as you said; the picture is {targets[2]}. Again: {_again(asker)}")
-        for target in (*targets[:2], *([] if part is None or part.same else [part.target])):
+        for target in written:
             # Complete beside its target, so that the target is replaced in one step.
             near = target.with_name(f".{target.name}.new")
             near.write_bytes((there / target.name).read_bytes())
             near.replace(target)
-    return Made(targets[0], targets[1], targets[2], name=name, seen=proposal.share, place=found, notes=tuple(notes))
+    return Made(targets[0], targets[1], targets[2], seen=proposal.share, place=found, notes=tuple(notes))
 
 
 def _origin(mesh: Path, unit: str, seen: Path, laid: Laid) -> tuple[str, ...]:
@@ -190,9 +186,12 @@ def _beside(target: Path, mesh: Path) -> Path:
     return target.with_name(f"{target.stem}-surface.stl") if same else target
 
 
-def _require_room(asker: Asker, targets: tuple[Path, ...], overwrite: bool) -> None:
+def _require_room(asker: Asker, targets: tuple[Path, ...], overwrite: bool, given: list[Path]) -> None:
     if not targets[0].parent.is_dir():
         raise ConfigError(f"there is no folder {targets[0].parent}; make it first, or name another one with --folder")
+    for target in targets:
+        if target.exists() and any(map(target.samefile, given)):
+            raise ConfigError(f"{target} is a mesh that was given, and would be overwritten; take another --name")
     there = [str(target) for target in targets if target.exists()]
     if not there or overwrite:
         return

@@ -80,11 +80,9 @@ def calibrate_pairs(pairs: Sequence[Pair]) -> RecordedResult:
     left_out, found = float(np.sqrt(np.mean(off**2))), refined.flange_from_camera
     method, scatter = "Park-Martin, then robust least squares on the poses", (refined.scatter_m, refined.scatter_rad)
     result.hand_eye = {
-        **hand_eye_figures(setup, method, found, scatter, sigma),
-        "left_out": {"board_mm": 1e3 * left_out},
-        "frames": len(kept),
-        "closed_form": closed_form_figures(setup, closed),
-    }
+        **hand_eye_figures(setup, method, found, scatter, sigma), "left_out": {"board_mm": 1e3 * left_out},
+        "frames": len(kept), "closed_form": closed_form_figures(setup, closed),
+    }  # fmt: skip
     result.notes += setup_note(setup, found)
     result.notes.append("pairs of poses only: no intrinsics, no light plane, no flatness")
     reach = float(np.median([np.linalg.norm(b.translation) for b in boards]))

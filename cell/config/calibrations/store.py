@@ -359,11 +359,9 @@ def _lens(camera: CameraModel) -> dict[str, float]:
 
 def _quality(quality: Quality) -> dict[str, float]:
     figures = {
-        "views": quality.views,
-        "chi2_per_dof": round(quality.chi2_per_dof, 3),
-        "dots_rms_px": round(quality.dots_rms_px, 5),
-        "held_out_dots_rms_px": round(quality.held_out_px, 4),
-    }
+        "views": quality.views, "chi2_per_dof": round(quality.chi2_per_dof, 3),
+        "dots_rms_px": round(quality.dots_rms_px, 5), "held_out_dots_rms_px": round(quality.held_out_px, 4),
+    }  # fmt: skip
     if quality.stripe_rms is not None and quality.held_out_stripe is not None:
         figures["stripe_rms_mm"] = round(1e3 * quality.stripe_rms, 5)
         figures["held_out_stripe_rms_mm"] = round(1e3 * quality.held_out_stripe, 5)

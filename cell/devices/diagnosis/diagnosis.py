@@ -239,12 +239,8 @@ def _laser_state(laser: interfaces.Laser) -> str:
 
 
 STATES: dict[str, Callable[[Any], str]] = {
-    "arm": _arm_state,
-    "rail": _rail_state,
-    "vehicle": _vehicle_state,
-    "scan_camera": _camera_state,
-    "target_camera": _camera_state,
-    "laser": _laser_state,
+    "arm": _arm_state, "rail": _rail_state, "vehicle": _vehicle_state, "scan_camera": _camera_state,
+    "target_camera": _camera_state, "laser": _laser_state,
     "claw": lambda claw: "holds a part" if claw.holding else "empty",
-}
+}  # fmt: skip
 """The devices in the order in which they are asked, and how each tells its state in words."""

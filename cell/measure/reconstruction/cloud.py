@@ -83,11 +83,9 @@ class Cloud:
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
         return {
-            "lines": self.shape[0],
-            "points": self.size,
-            "rejected": int(np.count_nonzero(self.rejected)),
+            "lines": self.shape[0], "points": self.size, "rejected": int(np.count_nonzero(self.rejected)),
             "interpolated": len(self.filled.lines),
-        }
+        }  # fmt: skip
 
     def each_sweep(self) -> list[slice]:
         """The lines of each sweep."""

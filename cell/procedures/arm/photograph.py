@@ -61,12 +61,10 @@ class BoardFix:
         """Figures for the journal."""
         sigma = np.sqrt(np.diag(self.covariance))
         return {
-            "residual_px": round(self.residual_px, 4),
-            "obliquity_deg": round(math.degrees(self.obliquity), 2),
-            "sigma_mm": [round(1e3 * s, 4) for s in sigma[:3]],
-            "sigma_mrad": [round(1e3 * s, 4) for s in sigma[3:]],
+            "residual_px": round(self.residual_px, 4), "obliquity_deg": round(math.degrees(self.obliquity), 2),
+            "sigma_mm": [round(1e3 * s, 4) for s in sigma[:3]], "sigma_mrad": [round(1e3 * s, 4) for s in sigma[3:]],
             "swung_mm": round(1e3 * self.swung, 4),
-        }
+        }  # fmt: skip
 
 
 def photograph(

@@ -87,11 +87,9 @@ class TouchCheck:
     def as_dict(self) -> dict[str, float]:
         """For the journal."""
         return {
-            "felt_mm": round(1e3 * self.felt.height, 4),
-            "expected_mm": round(1e3 * self.expected.height, 4),
-            "off_mm": round(1e3 * self.off, 4),
-            "sigma_mm": round(1e3 * self.sigma, 4),
-        }
+            "felt_mm": round(1e3 * self.felt.height, 4), "expected_mm": round(1e3 * self.expected.height, 4),
+            "off_mm": round(1e3 * self.off, 4), "sigma_mm": round(1e3 * self.sigma, 4),
+        }  # fmt: skip
 
     @property
     def _words(self) -> str:

@@ -56,14 +56,11 @@ class VehicleArrival:
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
         return {
-            "error_along_mm": round(1e3 * self.error_along, 2),
-            "error_across_mm": round(1e3 * self.error_across, 2),
-            "error_yaw_deg": round(math.degrees(self.error_yaw), 3),
-            "photographs": self.photographs,
-            **({} if self.driven else {"driven": False}),
-            **({} if self.shared is None else {"shared": True}),
+            "error_along_mm": round(1e3 * self.error_along, 2), "error_across_mm": round(1e3 * self.error_across, 2),
+            "error_yaw_deg": round(math.degrees(self.error_yaw), 3), "photographs": self.photographs,
+            **({} if self.driven else {"driven": False}), **({} if self.shared is None else {"shared": True}),
             **({} if self.head is None else {"interim": self.head.summary()}),
-        }
+        }  # fmt: skip
 
     def words(self) -> str:
         """What became of the step where nothing drives, in words."""

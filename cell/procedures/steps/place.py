@@ -325,10 +325,8 @@ class AimedPlace:
     def of(cls, workplace: Workplace, pose: PlacePose) -> "AimedPlace":
         """By the parts of the batch before; straight at the place where they do not tell."""
         points, grasp, belongs = (
-            part_points(workplace.nominal),
-            workplace.job.grasp,
-            workplace.job.place.surface_from_part.se3(),
-        )
+            part_points(workplace.nominal), workplace.job.grasp, workplace.job.place.surface_from_part.se3(),
+        )  # fmt: skip
         unsure = grasp.covariance
         noise = expected_residual(workplace.job, workplace.repeatability, pose, points, unsure)
         allowed, slip = (

@@ -41,13 +41,9 @@ JOINTS = (
 )  # fmt: skip
 """As the maker's own description of the arm names them."""
 COLOURS = {
-    "part": (0.95, 0.65, 0.10, 1.0),
-    "placed part": (0.95, 0.65, 0.10, 1.0),
-    "surface": (0.35, 0.65, 0.40, 0.5),
-    "board": (0.90, 0.90, 0.90, 1.0),
-    "scan head": (0.75, 0.20, 0.20, 0.8),
-    "target camera": (0.20, 0.35, 0.75, 0.8),
-}
+    "part": (0.95, 0.65, 0.10, 1.0), "placed part": (0.95, 0.65, 0.10, 1.0), "surface": (0.35, 0.65, 0.40, 0.5),
+    "board": (0.90, 0.90, 0.90, 1.0), "scan head": (0.75, 0.20, 0.20, 0.8), "target camera": (0.20, 0.35, 0.75, 0.8),
+}  # fmt: skip
 GREY = (0.55, 0.58, 0.62, 0.6)
 PICTURE_S = 10.0
 """Wall seconds that a picture may take to be encoded before its message is left out."""

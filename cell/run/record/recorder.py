@@ -198,10 +198,8 @@ class Recorder(logging.Handler):
         self._begun = self._times.now()
         self._bodies: dict[str, Body] = {}
         self._fixed = (
-            *arm_bodies(config.arm.model),
-            *tool_bodies(mounted=mounted(config)),
-            *vehicle_bodies(deck_plates(config)),
-        )
+            *arm_bodies(config.arm.model), *tool_bodies(mounted=mounted(config)), *vehicle_bodies(deck_plates(config)),
+        )  # fmt: skip
         self._about: tuple[object, object] = (None, None)
         self._listen()
 

@@ -60,13 +60,11 @@ def refusal(result: RunResult, folder: Path, frames: FrameStore) -> dict[str, ob
     if result.outcome not in JUDGED:
         return None
     return {
-        "step": ended_in(result),
-        "reason": result.reason,
+        "step": ended_in(result), "reason": result.reason,
         "numbers": [number.as_dict() for number in RefusalEvidence.of(result).numbers],
-        "frames": last_frames(result, frames),
-        "cloud": CLOUD if (folder / CLOUD).exists() else None,
+        "frames": last_frames(result, frames), "cloud": CLOUD if (folder / CLOUD).exists() else None,
         **({} if (placed := seen_placed(result)) is None else {"placed": placed.summary()}),
-    }
+    }  # fmt: skip
 
 
 def seen_placed(result: RunResult) -> PlacedPart | None:

@@ -52,11 +52,9 @@ def export_run(folder: Path, kind: str, out: Path, job: str | None, limit: float
         known = 1e3 * deviations[np.isfinite(deviations) & ~cloud.interpolated]
         if len(known):
             written["deviation_mm"] = {
-                "points": len(known),
-                "mean": float(known.mean()),
-                "rms": float(np.sqrt(np.mean(known**2))),
+                "points": len(known), "mean": float(known.mean()), "rms": float(np.sqrt(np.mean(known**2))),
                 "p95": float(np.percentile(np.abs(known), 95)),
-            }
+            }  # fmt: skip
     return written
 
 

@@ -81,14 +81,9 @@ def bar_places(spec: RigSpec) -> list[tuple[Array, Array]]:
         return centre - half, centre + half
 
     return [
-        bar(0.0, 0.0, near),
-        bar(0.0, 0.0, far),
-        bar(aside, 0.0, depth),
-        bar(-aside, 0.0, depth),
-        bar(0.0, rise, depth),
-        bar(aside, -rise, depth),
-        bar(-aside, rise, depth),
-    ]
+        bar(0.0, 0.0, near), bar(0.0, 0.0, far), bar(aside, 0.0, depth), bar(-aside, 0.0, depth), bar(0.0, rise, depth),
+        bar(aside, -rise, depth), bar(-aside, rise, depth),
+    ]  # fmt: skip
 
 
 def flat_poses(spec: RigSpec) -> list[pin.SE3]:
@@ -234,12 +229,9 @@ def _probing(cloud: Cloud, diameter: float) -> dict[str, float]:
     points = cloud.points[cloud.valid][chosen]
     normals = (points - fit.centre) / np.linalg.norm(points - fit.centre, axis=1, keepdims=True)
     return {
-        "points": len(points),
-        "form_mm": 1e3 * form_all(fit.deviations),
-        "form_95_mm": 1e3 * form_95(fit.deviations),
-        "size_mm": 1e3 * (2 * fit.radius - diameter),
-        "expected_95_mm": 1e3 * _noise_band(cloud, chosen, normals),
-    }
+        "points": len(points), "form_mm": 1e3 * form_all(fit.deviations), "form_95_mm": 1e3 * form_95(fit.deviations),
+        "size_mm": 1e3 * (2 * fit.radius - diameter), "expected_95_mm": 1e3 * _noise_band(cloud, chosen, normals),
+    }  # fmt: skip
 
 
 def _spacing(clouds: list[Cloud], true: float) -> dict[str, float]:

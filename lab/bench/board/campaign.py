@@ -58,23 +58,18 @@ class Tally:
             return round(1e3 * float(np.median(values)), 1) if values else None
 
         return {
-            "views": self.views,
-            "found": round(self.found / max(self.views, 1), 4),
-            "refused": round(self.refused / max(self.views, 1), 4),
-            "wrong": self.wrong,
-            "centre_rms_px": rms(self.points, 1.0),
-            "pose_mm": rms(self.places, 1e3),
-            "pose_mrad": rms(self.turns, 1e3),
+            "views": self.views, "found": round(self.found / max(self.views, 1), 4),
+            "refused": round(self.refused / max(self.views, 1), 4), "wrong": self.wrong,
+            "centre_rms_px": rms(self.points, 1.0), "pose_mm": rms(self.places, 1e3), "pose_mrad": rms(self.turns, 1e3),
             "z": round(float(np.sqrt(squares.mean() / 6)), 3) if len(squares) else None,
             "z_axes": np.sqrt(np.mean(np.square(self.scores), axis=0)).round(3).tolist() if self.scores else None,
             "coverage_95": round(float((squares < chi2.ppf(0.95, 6)).mean()), 3) if len(squares) else None,
-            "found_ms": middle(self.found_s),
-            "refused_ms": middle(self.refused_s),
+            "found_ms": middle(self.found_s), "refused_ms": middle(self.refused_s),
             "opencv_found": round(float(np.mean(self.peer_found)), 4) if self.peer_found else None,
             "opencv_ms": middle(self.peer_s),
             "slowest_ms": round(1e3 * max([*self.found_s, *self.refused_s], default=0.0), 1),
             "reasons": dict(sorted(self.reasons.items())),
-        }
+        }  # fmt: skip
 
     def __iadd__(self, other: "Tally") -> "Tally":
         for name, value in vars(other).items():

@@ -126,12 +126,9 @@ def one_world(level: str, untouched: int, seed: int) -> list[Row]:
             except RefusedError as error:
                 return {"seed": seed, "shift": name, "changed": True, "refused": True, "reason": str(error)}
             return {
-                "seed": seed,
-                "shift": name,
-                "s": cell.clock.now() - begun,
-                "refused": _refused(found),
+                "seed": seed, "shift": name, "s": cell.clock.now() - begun, "refused": _refused(found),
                 **found.summary(),
-            }
+            }  # fmt: skip
 
         rows = [look(UNTOUCHED) for _ in range(untouched)]
         world = cell.world

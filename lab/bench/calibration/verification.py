@@ -62,16 +62,11 @@ class Promise:
         """For reports, in mm or degrees."""
         factor = 1e3 if self.change.unit == "m" else float(np.degrees(1.0))
         return {
-            "part": self.change.part,
-            "change": self.change.kind,
-            "mean": round(factor * float(np.mean(self.sizes)), 4),
-            "largest": round(factor * max(self.sizes), 4),
-            "wanted": round(factor * self.change.wanted, 4),
-            "unit": ("mm" if self.change.unit == "m" else "deg") + self.change.where,
-            "checks": len(self.sizes),
-            "found_percent": _percent(self.found),
-            "bad_at_a_third_percent": _percent(self.bad_at_a_third),
-        }
+            "part": self.change.part, "change": self.change.kind, "mean": round(factor * float(np.mean(self.sizes)), 4),
+            "largest": round(factor * max(self.sizes), 4), "wanted": round(factor * self.change.wanted, 4),
+            "unit": ("mm" if self.change.unit == "m" else "deg") + self.change.where, "checks": len(self.sizes),
+            "found_percent": _percent(self.found), "bad_at_a_third_percent": _percent(self.bad_at_a_third),
+        }  # fmt: skip
 
 
 def disturbances() -> list[Disturbance]:
@@ -180,17 +175,13 @@ def campaign(
     promised = {key: promise.summary() for key, promise in promises.items()}
     false = [alarm for checks_of_one in alarms for alarm in checks_of_one]
     return {
-        "level": level,
-        "seeds": len(seeds),
-        "false_alarm_percent": _percent(false, 2),
-        "checks_of_good": len(false),
-        "change_seen_percent": _percent(told, 2),
-        "calibrations_with_a_false_alarm": sum(map(any, alarms)),
+        "level": level, "seeds": len(seeds), "false_alarm_percent": _percent(false, 2), "checks_of_good": len(false),
+        "change_seen_percent": _percent(told, 2), "calibrations_with_a_false_alarm": sum(map(any, alarms)),
         "disturbances": [_row(each, suspected[each.name], promised[each.part, each.kind]) for each in chosen],
         "detectable": list(promised.values()),
         "bad_at_a_third_percent": _percent([bad for each in promises.values() for bad in each.bad_at_a_third]),
         "found_at_detectable_percent": _percent([found for each in promises.values() for found in each.found]),
-    }
+    }  # fmt: skip
 
 
 def _row(disturbance: Disturbance, suspected: Sequence[Sequence[str]], promised: dict[str, Any]) -> dict[str, Any]:

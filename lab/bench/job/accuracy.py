@@ -69,12 +69,9 @@ def one_run(job: str, seed: int, level: str) -> dict[str, Any]:
 def figures(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSurface) -> dict[str, Any]:
     """The errors of one record, lists of single distances in mm; parts that it did not come to are missing."""
     made: dict[str, Any] = {
-        "seed": record.seed,
-        "level": record.level,
-        "outcome": record.outcome,
-        "reason": record.reason,
+        "seed": record.seed, "level": record.level, "outcome": record.outcome, "reason": record.reason,
         "stage": record.stage,
-    }
+    }  # fmt: skip
     if record.calibration is not None:
         made["chi2_calibration"] = record.calibration.scan.quality.chi2_per_dof
         made["chi2_target"] = record.calibration.target.quality.chi2_per_dof

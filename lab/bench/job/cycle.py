@@ -90,14 +90,11 @@ def told(found: Sequence[Activity], length: float, least: Callable[[Activity], f
     lit = sum(activity.end - activity.begin for activity in found if activity.device == "laser")
     lasts, leasts = (sum(float(str(one[key])) for one in motions) for key in ("lasts_s", "least_s"))
     return {
-        "length_s": round(length, 2),
-        "arm_and_vehicle_s": round(lasts, 2),
-        "their_least_s": round(leasts, 2),
+        "length_s": round(length, 2), "arm_and_vehicle_s": round(lasts, 2), "their_least_s": round(leasts, 2),
         "laser_lit_s": round(lit, 2),
         "nothing_done_s": round(sum(end - begin for begin, end in idle(found, length)), 2),
-        "of_the_least": round(length / max(leasts + lit, 1e-9), 3),
-        "motions": motions,
-    }
+        "of_the_least": round(length / max(leasts + lit, 1e-9), 3), "motions": motions,
+    }  # fmt: skip
 
 
 def _beside(activity: Activity, other: Activity) -> bool:

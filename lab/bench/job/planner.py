@@ -125,13 +125,10 @@ def _figures(name: str, joined: Planner, rows: Sequence[Mapping[str, Search]], w
     found = [row[name].way for row in rows]
     least = [least_distance(joined, way) for way in found if way is not None]
     return {
-        "planner": name,
-        "solved": len(least),
-        "of_those_with_a_way": round(len(least) / max(1, sum(ways)), 4),
-        "median_s": round(float(np.median(took)), 3),
-        "p99_s": round(float(np.percentile(took, 99)), 3),
+        "planner": name, "solved": len(least), "of_those_with_a_way": round(len(least) / max(1, sum(ways)), 4),
+        "median_s": round(float(np.median(took)), 3), "p99_s": round(float(np.percentile(took, 99)), 3),
         "least_distance_mm": round(1e3 * min(least, default=np.nan), 2),
-    }
+    }  # fmt: skip
 
 
 def least_distance(joined: Planner, way: NDArray[np.float64]) -> float:

@@ -53,10 +53,8 @@ class DashboardServer:
         self._reports = 0
         self._answers: dict[str, Callable[[], str]] = {
             "polyscopeversion": lambda: "URSoftware " + ".".join(map(str, VERSION)) + " (Nov 10 2023)",
-            "version": lambda: ".".join(map(str, VERSION[:3])),
-            "get serial number": lambda: model.params.serial,
-            "get robot model": lambda: model.params.model,
-            "robotmode": lambda: f"Robotmode: {_MODES[model.power]}",
+            "version": lambda: ".".join(map(str, VERSION[:3])), "get serial number": lambda: model.params.serial,
+            "get robot model": lambda: model.params.model, "robotmode": lambda: f"Robotmode: {_MODES[model.power]}",
             "safetymode": lambda: f"Safetymode: {self._safety()}",
             "safetystatus": lambda: f"Safetystatus: {self._safety()}",
             "is in remote control": lambda: str(model.remote).lower(),
@@ -64,17 +62,11 @@ class DashboardServer:
             "programstate": lambda: f"{_STATES[program.runtime_state]} {self._name()}",
             "get loaded program": lambda: f"Loaded program: {self._loaded}" if self._loaded else "No program loaded",
             "isprogramsaved": lambda: f"{str(bool(self._loaded)).lower()} {self._name()}",
-            "get operational mode": lambda: self._mode,
-            "clear operational mode": self._clear_mode,
-            "close popup": self._close_popup,
-            "power on": self._power_on,
-            "power off": self._power_off,
-            "brake release": self._brake_release,
-            "unlock protective stop": self._unlock,
-            "stop": self._stop,
-            "play": self._play,
-            "pause": lambda: "Pausing program" if program.pause() else "Failed to execute: pause",
-        }
+            "get operational mode": lambda: self._mode, "clear operational mode": self._clear_mode,
+            "close popup": self._close_popup, "power on": self._power_on, "power off": self._power_off,
+            "brake release": self._brake_release, "unlock protective stop": self._unlock, "stop": self._stop,
+            "play": self._play, "pause": lambda: "Pausing program" if program.pause() else "Failed to execute: pause",
+        }  # fmt: skip
 
     def answer(self, command: str) -> str:
         """The reply line to one command line, without its end."""

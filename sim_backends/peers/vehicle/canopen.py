@@ -303,38 +303,29 @@ class DriveNode:
             return Value(form, value, writable=True, write=write)
 
         return {
-            (0x1000, 0): Value("<I", 0x00020192),
-            (0x1018, 0): Value("<B", 4),
-            (0x1018, 1): Value("<I", 0x0000031F),
-            (0x1018, 2): Value("<I", 402),
-            (0x1018, 3): Value("<I", 0x00010004),
+            (0x1000, 0): Value("<I", 0x00020192), (0x1018, 0): Value("<B", 4), (0x1018, 1): Value("<I", 0x0000031F),
+            (0x1018, 2): Value("<I", 402), (0x1018, 3): Value("<I", 0x00010004),
             (0x1018, 4): Value("<I", 7000 + number),
             (0x6007, 0): option("<h", 1, (0, 1, 2, 3), name="connection_lost_as"),
             (0x603F, 0): Value("<H", mappable=True, read=lambda: self._code),
             (0x6040, 0): Value("<H", writable=True, mappable=True, write=self._control),
             (0x6041, 0): Value("<H", mappable=True, read=lambda: wheel.statusword),
-            (0x605A, 0): option("<h", 2, (1, 2, 5, 6), name="quick_stop_option"),
-            (0x605D, 0): option("<h", 1, (1, 2)),
-            (0x605E, 0): option("<h", 2, (0, 1, 2)),
-            (0x6060, 0): option("<b", 0, (0, 3), name="mode"),
+            (0x605A, 0): option("<h", 2, (1, 2, 5, 6), name="quick_stop_option"), (0x605D, 0): option("<h", 1, (1, 2)),
+            (0x605E, 0): option("<h", 2, (0, 1, 2)), (0x6060, 0): option("<b", 0, (0, 3), name="mode"),
             (0x6061, 0): Value("<b", mappable=True, read=lambda: wheel.mode),
             (0x6064, 0): Value("<i", mappable=True, read=self._position),
             (0x606C, 0): Value("<i", mappable=True, read=lambda: round(self._sign * wheel.speed / self._rim_per_unit)),
             (0x6079, 0): Value("<I", mappable=True, read=lambda: round(1e3 * self._peer.model.params.battery_volts)),
-            (0x6083, 0): ramp("acceleration"),
-            (0x6084, 0): ramp("deceleration"),
-            (0x6085, 0): ramp("quick_deceleration"),
-            (0x608F, 0): Value("<B", 2),
-            (0x608F, 1): Value("<I", settings.counts_per_turn),
-            (0x608F, 2): Value("<I", 1),
+            (0x6083, 0): ramp("acceleration"), (0x6084, 0): ramp("deceleration"),
+            (0x6085, 0): ramp("quick_deceleration"), (0x608F, 0): Value("<B", 2),
+            (0x608F, 1): Value("<I", settings.counts_per_turn), (0x608F, 2): Value("<I", 1),
             (0x60A9, 0): Value("<I", prefix << 24 | numerator << 16 | denominator << 8),
-            (0x60FD, 0): Value("<I", mappable=True, read=self._inputs),
-            (0x60FE, 0): Value("<B", 2),
+            (0x60FD, 0): Value("<I", mappable=True, read=self._inputs), (0x60FE, 0): Value("<B", 2),
             (0x60FE, 1): Value("<I", writable=True, mappable=True, write=partial(setattr, self, "_outputs")),
             (0x60FE, 2): Value("<I", writable=True, write=partial(setattr, self, "_mask")),
             (0x60FF, 0): Value("<i", writable=True, mappable=True, write=self._aim),
             (0x6502, 0): Value("<I", 0x00000005),
-        }
+        }  # fmt: skip
 
     @property
     def _turn(self) -> float:

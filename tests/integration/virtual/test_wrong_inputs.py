@@ -249,7 +249,7 @@ def test_all_that_is_wrong_is_told_at_once_and_as_json(typed: Typed, place: Path
 RIGHT_CONFIGURATIONS = [
     ("rail.url", '"socket://10.0.0.5:4001"'),
     ("rail.microsteps", "64"),
-    ("rail.travel", '["5 mm", "120 mm"]'),
+    ("rail.travel", '["-5 mm", "120 mm"]'),
     ("rail.lead", '"0.1 inch"'),
     ("vehicle.channel", '"socket://10.0.0.6:3000"'),
     ("arm.max_tool_speed", '"0.25 m/s"'),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -38,24 +38,18 @@ PosesOption = Annotated[
 PoseFieldOption = Annotated[
     str | None, typer.Option("--pose-field", help="Which of several recorded poses is the flange's.")
 ]
+Setup = Literal["eye-in-hand", "eye-to-hand"]
 SetupOption = Annotated[
-    str | None, typer.Option("--setup", help="Where the camera was: eye-in-hand or eye-to-hand; else the poses tell.")
+    Setup | None, typer.Option("--setup", help="Where the camera was: eye-in-hand or eye-to-hand; else the poses tell.")
 ]
-CameraOption = Annotated[
-    str | None,
-    typer.Option(
-        "--camera",
-        help='A camera that is known: a file (JSON of an earlier result, or YAML of OpenCV or ROS), or "pictures": '
-        "the arm has no say in it.",
-    ),
-]
-LaserOption = Annotated[
-    str | None,
-    typer.Option(
-        "--laser",
-        help="The laser's colour: red, green, blue, grey; none; or auto: the pictures tell, which is the default.",
-    ),
-]
+CameraOption = Annotated[str | None, typer.Option(
+    "--camera", help='A camera that is known: a file (JSON of an earlier result, or YAML of OpenCV or ROS), or '
+    '"pictures": the arm has no say in it.',
+)]  # fmt: skip
+Laser = Literal["none", "red", "green", "blue", "grey", "auto"]
+LaserOption = Annotated[Laser | None, typer.Option(
+    "--laser", help="The laser's colour: red, green, blue, grey; none; or auto, the default: the pictures tell."
+)]  # fmt: skip
 DetailsOption = Annotated[
     bool, typer.Option("--details", help="With --from: every picture, value, check and note as well.")
 ]
@@ -111,18 +105,13 @@ def calibrate(
 
 
 def _options(
-    plan: bool, poses: str | None, pose_field: str | None, setup: str | None, camera: str | None, laser: str | None
+    plan: bool, poses: str | None, pose_field: str | None, setup: Setup | None, camera: str | None, laser: Laser | None
 ) -> Options:
-    """What was said of a recording. Raises ConfigError for a word that is none of those allowed."""
+    """What was said of a recording."""
     from cell.apps.recordings.command import Options
     from cell.apps.recordings.known_camera import read_camera
     from cell.measure.vision.stripe.planes import LaserChannel
 
-    lasers = ("none", "red", "green", "blue", "grey", "auto")
-    if setup not in (None, "eye-in-hand", "eye-to-hand"):
-        raise ConfigError(f"--setup {setup}: allowed are eye-in-hand and eye-to-hand")
-    if laser not in (None, *lasers):
-        raise ConfigError(f"--laser {laser}: allowed are {', '.join(lasers)}")
     return Options(
         poses, pose_field, setup=None if setup is None else setup.replace("-", "_"), plan=plan,
         camera=None if camera in (None, "pictures") else read_camera(Path(str(camera))),

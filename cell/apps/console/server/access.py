@@ -125,13 +125,10 @@ def _checked(schemas: Mapping[str, type[PageMessage]], kind: str, words: Mapping
 COOKIE = "cell_console"
 POLICY = "default-src 'self'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'; object-src 'none'"
 HEADERS = {
-    "content-security-policy": POLICY,
-    "x-content-type-options": "nosniff",
-    "x-frame-options": "DENY",
-    "referrer-policy": "no-referrer",
-    "cross-origin-opener-policy": "same-origin",
+    "content-security-policy": POLICY, "x-content-type-options": "nosniff", "x-frame-options": "DENY",
+    "referrer-policy": "no-referrer", "cross-origin-opener-policy": "same-origin",
     "cross-origin-resource-policy": "same-origin",
-}
+}  # fmt: skip
 MOST_SESSIONS = 64
 MOST_COOKIE_BYTES = 4096
 

@@ -103,10 +103,8 @@ class Readings:
             "joints": None if self.arm is None else [round(float(q), 5) for q in self.arm.joints],
             "flange": None if self.arm is None else [round(float(v), 6) for v in self.arm.flange],
             "rail": None if self.rail is None else round(self.rail, 6),
-            "vehicle": None if vehicle is None else _vehicle(vehicle),
-            "laser": self.laser,
-            "holding": self._held,
-        }
+            "vehicle": None if vehicle is None else _vehicle(vehicle), "laser": self.laser, "holding": self._held,
+        }  # fmt: skip
 
     def safety(self) -> dict[str, object]:
         """The arm's safety state, the vehicle's emergency stop, and whether a stop holds direct commands."""

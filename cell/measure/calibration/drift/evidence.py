@@ -196,11 +196,7 @@ def evidence(
     What the arm scatters beyond its repeatability is the posture's own, the same at each rest. The calibration's own
     picture from there shows how large that is.
     """
-    before = []
-    if (known := reference.pictures.get(name)) is not None:
-        rest, stop = 1 + max(look.rest for look in looks), 1 + max(look.stop for look in looks)
-        before = [PictureMeasurements(known.measured(state, looks[0].data), rest, stop)]
-    every = [*looks, *before]
+    every = [*looks, *_before(state, reference, looks, name)]
     rests = 1 + max(look.rest for look in every)
     stops = 1 + max(look.stop for look in every)
     size = SHARED + 6 * rests + stops
@@ -241,6 +237,15 @@ def evidence(
         kinds["stripe"], np.r_[BOARD], scipy.linalg.block_diag(*along) * SWEEP_PICTURE_M if along else None
     )
     return DriftEvidence(score, 0.5 * (information + information.T), dots, stripe)
+
+
+def _before(
+    state: AdjustmentState, reference: Reference, looks: Sequence[PictureMeasurements], name: str
+) -> list[PictureMeasurements]:
+    if (known := reference.pictures.get(name)) is None:
+        return []
+    rest, stop = 1 + max(look.rest for look in looks), 1 + max(look.stop for look in looks)
+    return [PictureMeasurements(known.measured(state, looks[0].data), rest, stop)]
 
 
 def dots_of(photo: ScanObservation) -> ViewData:
@@ -294,11 +299,9 @@ def hypotheses(chain: str, focal: float) -> list[Hypothesis]:
     mount, lens = f"{chain} camera's mount on the flange", f"{chain} camera's lens"
     depth = SCAN_DEPTH if chain == "scan" else TARGET_DEPTH
     made = [
-        Hypothesis(mount, tuple(hand[:3]), (SHIFT,) * 3),
-        Hypothesis(mount, tuple(hand[3:]), (TURN,) * 3),
-        Hypothesis(lens, (2, 3), (TURN * focal,) * 2),
-        Hypothesis(lens, (0, 1), (SHIFT / depth * focal,) * 2),
-    ]
+        Hypothesis(mount, tuple(hand[:3]), (SHIFT,) * 3), Hypothesis(mount, tuple(hand[3:]), (TURN,) * 3),
+        Hypothesis(lens, (2, 3), (TURN * focal,) * 2), Hypothesis(lens, (0, 1), (SHIFT / depth * focal,) * 2),
+    ]  # fmt: skip
     if chain == "scan":
         plane, rail = range(PLANE.start, PLANE.stop), range(RAIL.start, RAIL.stop)
         made += [

@@ -73,15 +73,10 @@ class QualityCheck:
     def as_dict(self) -> dict[str, object]:
         """For the JSON."""
         return {
-            "part": self.part,
-            "name": self.name,
-            "value": self.value if abs(self.value) < float("inf") else None,
-            "doubt_from": self.doubt,
-            "refused_from": self.refuse if self.refuse < float("inf") else None,
-            "unit": self.unit,
-            "verdict": self.verdict,
-            "text": self.text,
-        }
+            "part": self.part, "name": self.name, "value": self.value if abs(self.value) < float("inf") else None,
+            "doubt_from": self.doubt, "refused_from": self.refuse if self.refuse < float("inf") else None,
+            "unit": self.unit, "verdict": self.verdict, "text": self.text,
+        }  # fmt: skip
 
 
 def refused_parts(checks: Iterable[QualityCheck]) -> dict[str, list[QualityCheck]]:

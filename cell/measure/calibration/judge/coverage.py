@@ -99,21 +99,18 @@ class Coverage:
         means = np.linalg.norm(self.cell_means(), axis=2)
         lit = len(self.stripe) > 0
         return {
-            "views": len(self.depth),
-            "dots": len(self.dots),
+            "views": len(self.depth), "dots": len(self.dots),
             "field_covered": float(np.mean(self.counts(self.dots) >= LEAST_IN_CELL)),
             "dots_rms_px": float(np.sqrt(np.mean(self.dots_off**2))),
             "largest_cell_mean_px": float(np.nanmax(means)) if np.isfinite(means).any() else None,
-            "depth_mm": _range(1e3 * self.depth),
-            "tilt_about_x_deg": _range(np.degrees(self.tilt[:, 0])),
-            "tilt_about_y_deg": _range(np.degrees(self.tilt[:, 1])),
-            "rail_mm": _range(1e3 * self.rail),
+            "depth_mm": _range(1e3 * self.depth), "tilt_about_x_deg": _range(np.degrees(self.tilt[:, 0])),
+            "tilt_about_y_deg": _range(np.degrees(self.tilt[:, 1])), "rail_mm": _range(1e3 * self.rail),
             "stripe_points": len(self.stripe),
             "stripe_rms_px": float(np.sqrt(np.mean(self.stripe_off**2))) if lit else None,
             "stripe_depth_mm": _range(1e3 * self.stripe_depth) if lit else None,
             "stripe_columns_px": _range(self.stripe[:, 0]) if lit else None,
             "stripe_rows_px": _range(self.stripe[:, 1]) if lit else None,
-        }
+        }  # fmt: skip
 
 
 def _range(values: Array) -> list[float]:

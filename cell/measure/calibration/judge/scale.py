@@ -29,12 +29,9 @@ NAMED_SHARE = 1e-3
 EXPLAINS, CLEARLY = 0.5, 0.7
 """Shares of the squared residuals from which a scale is believed, and from which it refuses by itself."""
 INDEPENDENT = (
-    "closed form against adjustment",
-    "closed form against least squares",
-    "board in left-out frames",
-    "board in left-out pairs",
-    "the arm's scatter",
-)
+    "closed form against adjustment", "closed form against least squares", "board in left-out frames",
+    "board in left-out pairs", "the arm's scatter",
+)  # fmt: skip
 """Checks of the hand-eye that say the same by other means."""
 
 

@@ -227,12 +227,10 @@ class TargetCalibration:
     def as_dict(self) -> dict[str, object]:
         """For storage."""
         return {
-            "camera": self.camera.as_dict(),
-            "flange_from_camera": self.flange_from_camera.homogeneous.tolist(),
-            "hand_eye_covariance": self.hand_eye_covariance.tolist(),
-            "quality": vars(self.quality),
+            "camera": self.camera.as_dict(), "flange_from_camera": self.flange_from_camera.homogeneous.tolist(),
+            "hand_eye_covariance": self.hand_eye_covariance.tolist(), "quality": vars(self.quality),
             "reference": None if self.reference is None else self.reference.as_dict(),
-        }
+        }  # fmt: skip
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:

@@ -208,8 +208,6 @@ def next_places(spec: BoardSpec) -> list[tuple[str, Array]]:
         return np.column_stack([across, y]).astype(np.float64)
 
     return [
-        ("first row", place(i, -1)),
-        ("last row", place(i, rows)),
-        ("first column", place(-1, j)),
+        ("first row", place(i, -1)), ("last row", place(i, rows)), ("first column", place(-1, j)),
         ("last column", place(cols, j)),
-    ]
+    ]  # fmt: skip

@@ -35,14 +35,9 @@ MOST_FOREIGN = 2
 MARKER_TOLERANCE = 0.2
 # Each kind of marker with its smaller sets first: a smaller one is the likelier name for what both can read.
 DICTIONARIES = (
-    *(f"DICT_{n}X{n}_{count}" for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
-    "DICT_ARUCO_ORIGINAL",
-    "DICT_APRILTAG_16h5",
-    "DICT_APRILTAG_25h9",
-    "DICT_APRILTAG_36h10",
-    "DICT_APRILTAG_36h11",
-    "DICT_ARUCO_MIP_36h12",
-)
+    *(f"DICT_{n}X{n}_{count}" for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)), "DICT_ARUCO_ORIGINAL",
+    "DICT_APRILTAG_16h5", "DICT_APRILTAG_25h9", "DICT_APRILTAG_36h10", "DICT_APRILTAG_36h11", "DICT_ARUCO_MIP_36h12",
+)  # fmt: skip
 
 
 def find_charuco(image: Image, spec: BoardSpec) -> BoardView:

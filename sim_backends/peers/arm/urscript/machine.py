@@ -46,16 +46,9 @@ class Machine:
         self._threads: dict[int, Thread] = {}
         self._turns = 0
         self._names: dict[str, Any] = known | {
-            "__builtins__": {"bool": bool},
-            "List": List,
-            "Pose": ScriptPose,
-            "own": self._own,
-            "turn": self._turn,
-            "halt": _halt,
-            "run": self._run_thread,
-            "kill": self._kill,
-            "join": self._join,
-        }
+            "__builtins__": {"bool": bool}, "List": List, "Pose": ScriptPose, "own": self._own, "turn": self._turn,
+            "halt": _halt, "run": self._run_thread, "kill": self._kill, "join": self._join,
+        }  # fmt: skip
         # The source holds nothing of the script's but numbers, texts and names with a `u_` before them.
         try:
             exec(compile(program.source, f"<{self.name}>", "exec"), self._names)

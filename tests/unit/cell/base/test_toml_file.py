@@ -64,3 +64,9 @@ def test_a_record_that_was_kept_is_restored_to_the_last_digit(tmp_path):
     path.write_text('{"rail": {}}')
     with pytest.raises(CellError, match="cannot be read as what the run was done with"):
         restored(File, path)
+
+
+def test_a_mark_of_the_order_of_bytes_is_no_part_of_the_text(tmp_path):
+    path = tmp_path / "x.toml"
+    path.write_bytes("\ufeffkey = 1\n".encode())
+    assert read_toml(path, "job", "") == {"key": 1}

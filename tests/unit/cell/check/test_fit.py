@@ -22,3 +22,10 @@ def test_a_way_between_two_stops_that_the_vehicle_cannot_go_is_refused(tmp_path,
     job, mesh = load_job(f"{changed_copy('two-stations', tmp_path, old, new)}#2")
     with pytest.raises(ConfigError, match=words):
         require_fit(job, load_config(None), mesh)
+
+
+def test_a_plate_that_the_rail_does_not_take_the_camera_to_is_refused():
+    config, (job, mesh) = load_config(None), load_job("pot")
+    far = config.model_copy(update={"laser": config.laser.model_copy(update={"witness": 0.9})})
+    with pytest.raises(ConfigError, match=r"laser\.witness 900 mm is outside rail\.travel, 0 to 100 mm"):
+        require_fit(job, far, mesh)

@@ -99,3 +99,8 @@ def test_how_deep_the_surface_reaches_into_the_part_is_noted():
 def test_a_surface_that_faces_away_from_the_part_is_refused(turn: str, wrong: bool):
     job = changed("place.surface_from_part.rotation", [turn, "0 deg", "0 deg"])
     assert any("face away" in text for text in surface_problems(job, mesh_box(MESH, "m"), MESH)) == wrong
+
+
+def test_an_area_beside_the_surface_is_refused():
+    job = changed("surface.area", [{"name": "far", "centre": ["900 mm", "0 mm"], "size": ["10 mm", "10 mm"]}])
+    assert any('surface.area "far" lies beside' in text for text in surface_problems(job, mesh_box(MESH, "m"), MESH))

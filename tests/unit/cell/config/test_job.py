@@ -48,6 +48,22 @@ def test_an_item_has_its_own_nest_and_surface_and_knows_where_the_others_are():
     assert old.nest is not None and old.nest.base_from_part.translation == (-0.6, 0.06, 0.03)
 
 
+@pytest.mark.parametrize(
+    ("name", "old", "new", "told"),
+    [
+        ("swap", 'kind = "unload"', 'kind = "load"', "item 2: after those before it its place has a part already"),
+        ("swap", 'kind = "load"', 'kind = "unload"', "item 2: after those before it its place is empty already"),
+    ],
+)
+def test_two_parts_do_not_go_into_one_place_nor_one_out_of_it_twice(tmp_path, name: str, old: str, new: str, told: str):
+    path = tmp_path / f"{name}.toml"
+    text = job_path(name).read_text(encoding="utf-8")
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(ConfigError, match=told):
+        load_job(path)
+
+
 def test_an_item_that_is_not_there_and_items_without_a_nest_are_told(tmp_path):
     for name in ("tray4#5", "pot#1"):
         with pytest.raises(ConfigError, match=r"has \d items: there is no item \d"):

@@ -32,6 +32,8 @@ def test_a_wrong_payload_is_weighed_written_and_not_weighed_again(tmp_path):
     again = Shown()
     made = opened(tmp_path, again)
     assert made.go(chosen((), "payload"))
+    with pytest.raises(ConfigError, match="nothing would be checked: verification comes after links"):
+        chosen(("verification",), "links")
     assert [verdict for _, verdict, _ in again.rows] == ["good already"] * 3
 
 

@@ -46,6 +46,9 @@ def test_a_job_from_its_mesh_fits_the_cell_and_no_file_is_lost(tmp_path):
     with pytest.raises(ConfigError, match=r"there already.*--overwrite"):
         from_options(tmp_path, mesh=str(mesh), name="lid", part_size="20 mm, 20 mm, 20 mm")
     assert made.job.read_text(encoding="utf-8") == written
+    part = relief(tmp_path / "lid.stl", waves)
+    with pytest.raises(ConfigError, match=r"lid\.stl is a mesh that was given, and would be overwritten"):
+        from_options(tmp_path, True, mesh=str(mesh), name="lid", part=str(part), part_unit="mm")
 
 
 def test_the_mesh_of_the_part_goes_beside_the_job_and_has_to_fit_its_surface(tmp_path, monkeypatch):

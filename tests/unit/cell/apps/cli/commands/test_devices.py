@@ -17,6 +17,8 @@ def test_a_jog_without_a_motion_and_a_recovery_by_nobody_say_what_they_lack(monk
     monkeypatch.setattr("cell.run.session.supervisor.Cell.open", lambda *_, **__: pytest.fail("the cell was opened"))
     refused = CliRunner().invoke(app, ["recover", "--sim", "all"])
     assert "a person has to look at the cell first" in str(refused.exception)
+    refused = CliRunner().invoke(app, ["recover", "--sim", "all", "--by", " "])
+    assert "a person has to look at the cell first" in str(refused.exception)
 
 
 def test_only_what_the_configured_cell_needs_ends_with_1(here: Path, monkeypatch):

@@ -68,3 +68,11 @@ def test_who_watches_a_run_sees_the_number_and_what_to_type(monkeypatch, capsys)
     display(Event("confirm_needed", "place", {"reason": "the arm has stopped", "code": "x", "number": 2}))
     said = capsys.readouterr().err
     assert "question 2: the arm has stopped" in said and "cell confirm --question 2" in said
+
+
+@pytest.mark.parametrize("command", [("report", "--html"), ("export",), ("record", "export")])
+def test_no_file_that_is_there_is_overwritten(waiting: Journal, here: Path, typed: Typed, command: tuple[str, ...]):
+    kept = here / "kept.ply"
+    kept.write_text("mine")
+    code, _, err = typed(*command, "--out", str(kept))
+    assert code == 2 and kept.read_text() == "mine" and "kept.ply is there already, and nothing is overwritten" in err

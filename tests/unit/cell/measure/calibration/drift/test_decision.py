@@ -13,7 +13,7 @@ from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import load_config
 from cell.config.job import load_job
 from cell.measure.calibration.drift.decision import detectable
-from cell.measure.calibration.drift.evidence import SHIFT, DriftEvidence, hypotheses, log_factor
+from cell.measure.calibration.drift.evidence import CHECKED_LARGE_VIEW, SHIFT, DriftEvidence, hypotheses, log_factor
 from cell.measure.calibration.drift.reference_plate import Pointing, turned
 from cell.measure.calibration.solve.normal import HAND, SHARED, AdjustmentState
 from cell.measure.geometry.camera import CameraModel
@@ -143,6 +143,8 @@ def test_the_views_are_aimed_where_mounts_and_boards_really_stand(harsh):
     rings = {row * cell.fine.cols + column for column, row in cell.fine.rings}
     for end in (low, high):
         assert rings <= set(cell.scan_view(rest, end).ids.tolist())
+    known = calibration.target.reference.pictures[CHECKED_LARGE_VIEW]
+    assert target_view.base_from_flange == known.base_from_flange
     assert len(cell.target_view(cell.move(target_view.base_from_flange.homogeneous)).ids) == len(cell.large.points())
 
 
