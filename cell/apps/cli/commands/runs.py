@@ -175,7 +175,7 @@ def report(
         from cell.run.report.page.make import write_page
 
         path = out or folder / "report.html"
-        _require_new(out)
+        _require_own(out, ".html")
         size = write_page(folder, path)
         if json:
             print_json({"run": folder.name, "file": str(path), "bytes": size})
@@ -215,7 +215,7 @@ def export(
     path = out or folder / f"export-{kind}{SUFFIXES[kind]}"
     if path.suffix.lower() != SUFFIXES[kind]:
         raise ConfigError(f"--out {path}: a file of format {kind} ends in {SUFFIXES[kind]}")
-    _require_new(out)
+    _require_own(out, path.suffix)
     written = export_run(folder, kind, path, job, end)
     if json:
         print_json(written)
@@ -308,7 +308,7 @@ def export_wires(
     path, _ = _record(name, config)
     suffix, write = FORMATS[kind]
     target = out or path.with_suffix(suffix)
-    _require_new(out)
+    _require_own(out, suffix)
     count = write(path, target)
     if json:
         print_json({"file": str(target), "lines": count})
@@ -353,12 +353,14 @@ def _record(name: str | None, config: Path | None) -> tuple[Path, Path | None]:
     return folder / FILE, folder
 
 
-def _require_new(out: Path | None) -> None:
-    """Raise `ConfigError` where a file that was named is there already, or its folder is not."""
-    if out is not None and not out.parent.is_dir():
+def _require_own(out: Path | None, suffix: str) -> None:
+    """Raise `ConfigError` where `out` is there and of another kind, or a run's, or where its folder is missing."""
+    if out is None:
+        return
+    if not out.parent.is_dir():
         raise ConfigError(f"--out {out}: there is no folder {out.parent}; make it first")
-    if out is not None and out.exists():
-        raise ConfigError(f"--out {out} is there already, and nothing is overwritten; name another file")
+    if out.exists() and (out.suffix != suffix or (out.parent / "report.json").exists()):
+        raise ConfigError(f"--out {out} is there already, and not of this command; name another file")
 
 
 @contextmanager

@@ -70,9 +70,17 @@ def test_who_watches_a_run_sees_the_number_and_what_to_type(monkeypatch, capsys)
     assert "question 2: the arm has stopped" in said and "cell confirm --question 2" in said
 
 
-@pytest.mark.parametrize("command", [("report", "--html"), ("export",), ("record", "export")])
-def test_no_file_that_is_there_is_overwritten(waiting: Journal, here: Path, typed: Typed, command: tuple[str, ...]):
-    kept = here / "kept.ply"
-    kept.write_text("mine")
-    code, _, err = typed(*command, "--out", str(kept))
-    assert code == 2 and kept.read_text() == "mine" and "kept.ply is there already, and nothing is overwritten" in err
+@pytest.mark.parametrize(
+    ("command", "file"),
+    [
+        (("report", "--html"), "own.toml"), (("export",), "runs/cloud.ply"), (("record", "export"), "own.toml"),
+        (("report", "--html"), "runs/x.html"),
+    ],
+)  # fmt: skip
+def test_only_what_the_command_wrote_before_is_overwritten(
+    waiting: Journal, here: Path, typed: Typed, command: tuple[str, ...], file: str
+):
+    (here / "runs" / "report.json").touch()
+    (here / file).write_text("mine")
+    code, _, err = typed(*command, "--out", file)
+    assert (code, (here / file).read_text()) == (2, "mine") and "is there already, and not of this command" in err
