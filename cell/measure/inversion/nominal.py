@@ -337,11 +337,14 @@ def _read(file: _MeshFile, unit: str) -> tuple[Array, NDArray[np.int64]]:
         mesh = trimesh.load_mesh(path, process=False)
         # Corners that are no numbers are looked for first: `process` drops them, and leaves a hole.
         finite = bool(np.isfinite(mesh.vertices).all())
+        declared = mesh.metadata.get("_ply_raw", {}).get("face", {}).get("length", 0)
         mesh.process()
         vertices, faces = np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
         alike = bool(mesh.is_winding_consistent)
     except Exception as error:  # every reader of trimesh raises its own
         raise ConfigError(UNREADABLE.format(path)) from error
+    if len(faces) and len(mesh.faces) < 0.99 * declared:
+        raise ConfigError(f"mesh {path} is cut: it holds {len(mesh.faces)} of {declared} triangles; copy it again")
     if vertices.ndim != 2 or not len(faces) or not finite:
         raise ConfigError(
             f"mesh {path} holds {len(faces)} triangles, or corners that are not numbers; give an STL or PLY"

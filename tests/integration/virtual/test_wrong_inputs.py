@@ -247,37 +247,22 @@ def test_all_that_is_wrong_is_told_at_once_and_as_json(typed: Typed, place: Path
 
 
 RIGHT_CONFIGURATIONS = [
-    ("rail.url", '"socket://10.0.0.5:4001"'),
-    ("rail.microsteps", "64"),
-    ("rail.travel", '["-5 mm", "120 mm"]'),
-    ("rail.lead", '"0.1 inch"'),
-    ("vehicle.channel", '"socket://10.0.0.6:3000"'),
-    ("arm.max_tool_speed", '"0.25 m/s"'),
-    ("arm.max_joint_speed", '"1 rad/s"'),
-    ("arm.settle_time", '"500 ms"'),
-    ("arm.vehicle_from_base", pose(300, 20, 550, 0, 0, 3)),
-    ("laser.output", "17"),
-    ("laser.tan_theta", "3"),
-    ("scan_camera.photo_exposure", '"5 ms"'),
-    ("calibration.max_age", '"2 week"'),
-    ("cell.confirm", '"person"'),
-]
+    ("rail.url", '"socket://10.0.0.5:4001"'), ("rail.microsteps", "64"), ("rail.travel", '["-5 mm", "120 mm"]'),
+    ("rail.lead", '"0.1 inch"'), ("vehicle.channel", '"socket://10.0.0.6:3000"'), ("arm.max_tool_speed", '"0.25 m/s"'),
+    ("arm.max_joint_speed", '"1 rad/s"'), ("arm.settle_time", '"500 ms"'),
+    ("arm.vehicle_from_base", pose(300, 20, 550, 0, 0, 3)), ("laser.output", "17"), ("laser.tan_theta", "3"),
+    ("scan_camera.photo_exposure", '"5 ms"'), ("calibration.max_age", '"2 week"'), ("cell.confirm", '"person"'),
+]  # fmt: skip
 
 
 RIGHT_JOBS = [
-    ("job.name", '"pot no. 7_b"'),
-    ("scan.mode", '"arm"'),
-    ("scan.swath", '[{ across = "-9 mm" }, { across = "9 mm", roll = "6 deg" }]'),
-    ("scan.length", '"80 mm"'),
-    ("approach.target", pose(-1000, 0, -600)),
-    ("approach.start", pose(-3050, 100, -600, 0, 0, 5)),
-    ("place.approach", '"80 mm"'),
-    ("place.tolerance", '"200 um"'),
-    ("photo.stand_off", '"850 mm"'),
-    ("grasp.size", '["60 mm", "40 mm", "25 mm"]'),
-    ("surface.place_from_surface", pose(10, -10, 2)),
+    ("job.name", '"pot no. 7_b"'), ("scan.mode", '"arm"'),
+    ("scan.swath", '[{ across = "-9 mm" }, { across = "9 mm", roll = "6 deg" }]'), ("scan.length", '"80 mm"'),
+    ("approach.target", pose(-1000, 0, -600)), ("approach.start", pose(-3050, 100, -600, 0, 0, 5)),
+    ("place.approach", '"80 mm"'), ("place.tolerance", '"200 um"'), ("photo.stand_off", '"850 mm"'),
+    ("grasp.size", '["60 mm", "40 mm", "25 mm"]'), ("surface.place_from_surface", pose(10, -10, 2)),
     ("board.spec", '"charuco:8x6:20mm"'),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,8 @@ from drivers.interfaces import ArmSafety, Motion
 
 RAIL_SPEED = 0.020
 ARM_SPEED, ARM_STEP = math.radians(5.0), math.radians(6.0)
+SLOW_SPEED, SLOW_STEP = math.radians(1.5), math.radians(12.0)
+"""Of joint 1 while a person reaches for the emergency stop."""
 VEHICLE_SPEED = 0.10
 BEFORE_S, WATCH_S, PERIOD_S = 0.5, 1.0, 0.01
 MOST_S = 1.0
@@ -96,12 +98,12 @@ def _rail_moves(sign: float, workplace: CommissionWorkplace) -> Motion:
     return workplace.devices.rail.move_to(goal, min(RAIL_SPEED, workplace.config.rail.max_speed))
 
 
-def _arm_moves(sign: float, workplace: CommissionWorkplace) -> Motion:
+def _arm_moves(sign: float, workplace: CommissionWorkplace, step: float = ARM_STEP, speed: float = ARM_SPEED) -> Motion:
     arm = workplace.devices.arm
     workplace.brake()
     goal = arm.state().joints.copy()
-    goal[0] += sign * ARM_STEP
-    return arm.move_joints(goal, ARM_SPEED, math.radians(40.0))
+    goal[0] += sign * step
+    return arm.move_joints(goal, speed, math.radians(40.0))
 
 
 def _vehicle_moves(sign: float, workplace: CommissionWorkplace) -> None:
@@ -194,25 +196,31 @@ def _emergency(workplace: CommissionWorkplace, result: Result) -> None:
     arm, clock, simulated = workplace.devices.arm, workplace.devices.clock, workplace.simulated
     workplace.fold()
     workplace.brake()
-    _arm_moves(1.0, workplace)
+    if not simulated and not workplace.person.go_ahead(
+        f"Joint 1 will turn by {math.degrees(SLOW_STEP):g} deg in {SLOW_STEP / SLOW_SPEED:.0f} s: press the emergency "
+        "stop while it turns."
+    ):
+        raise RefusedError("the emergency stop was not tried")
+    motion = _arm_moves(1.0, workplace) if simulated else _arm_moves(1.0, workplace, SLOW_STEP, SLOW_SPEED)
     clock.sleep(BEFORE_S)
     begun, before = clock.now(), _place(workplace, "arm")
-    cause = "emergency stop"
+    cause, remedy = "emergency stop", "Press it before joint 1 has turned to its end."
     if simulated:
         cause = "protective stop (simulated)"
         workplace.cause("arm.protective_stop")
-    elif not workplace.person.does("Press the emergency stop now, while joint 1 turns."):
-        workplace.cell.stop()
-        workplace.cell.clear_stop(BY)
-        raise RefusedError("the emergency stop was not tried")
-    deadline = time.monotonic() + 5.0
-    while arm.state().safety is ArmSafety.NORMAL and time.monotonic() < deadline:
+    deadline = time.monotonic() + 20.0
+    while arm.state().safety is ArmSafety.NORMAL and not motion.done and time.monotonic() < deadline:
         clock.sleep(PERIOD_S)
+    if arm.state().safety is ArmSafety.NORMAL:
+        # A motion that the button ended may be known before the button.
+        clock.sleep(BEFORE_S)
     stopped = arm.state().safety
     while float(np.abs(arm.state().joint_speeds).max()) > 1e-3 and time.monotonic() < deadline:
         clock.sleep(PERIOD_S)
     result.notes.append(f"after the {cause} the arm told: {stopped.value}")
-    result.require(f"arm, {cause}: it told so", stopped is not ArmSafety.NORMAL)
+    result.require(f"arm, {cause}: it told so", stopped is not ArmSafety.NORMAL, remedy)
+    if stopped is ArmSafety.NORMAL:
+        return
     if simulated:
         most, way = MOST_S * max(1.0, clock.rate), math.degrees(abs(_place(workplace, "arm") - before))
         result.measure(f"arm, {cause}: time to rest, at most", clock.now() - begun, "s", most=most)
@@ -227,7 +235,7 @@ CHECKS = [
     CommissionCheck(
         "stops", "Stops: from each cause, time and way",
         "rail, joint 1 and wheels, one after the other, each stopped on its way; the laser",
-        far="rail 20 mm, joint 1 6 deg, wheels 100 mm at most", fast="20 mm/s, 5 deg/s, 100 mm/s",
+        far="rail 20 mm, joint 1 12 deg, wheels 100 mm at most", fast="20 mm/s, 5 deg/s, 100 mm/s",
         limit=f"at rest within {MOST_S:g} s, {MOST_WAY['rail']:g} mm, {MOST_WAY['arm']:g} deg, "
         f"{MOST_WAY['vehicle']:g} mm",
         keys=("rail", "arm.model", "vehicle", "laser"), needs=("rail_limits", "vehicle", "outputs"), work=_stops,

@@ -10,7 +10,7 @@ from cell.apps.commission.check import CommissionCheck, Result
 from cell.apps.commission.checks.cameras import PITCH_OFF, renamed
 from cell.apps.commission.measuring import axes_from_shifts, eye_of, poses_of, see, shifted_views, views_from
 from cell.apps.commission.workplace import CommissionWorkplace
-from cell.config.job import job_path, ships
+from cell.config.job import job_path, load_job, ships
 from cell.measure.vision.board.view import BoardSpec, parse_board
 from cell.procedures.arm.photograph import look_pose
 from cell.procedures.drive.driving import Planar, RelativeOdometry, drive_line, driven
@@ -159,20 +159,21 @@ def judge_board(job: str, board: BoardSpec, across: float, result: Result) -> No
     """What a station's board says that is `across` times as large as `board`, its name in the file of `job`."""
     if abs(across - 1.0) <= PITCH_OFF:
         return
-    path, right = job_path(job), renamed(board, across)
+    path, right, stop = job_path(job), renamed(board, across), load_job(job)[0].at_stop
+    where = "[board]" if stop is None else f"[board], or the board of stop {stop},"
     remedy = "Measure from the first to the last point with a ruler; the vehicle drives by this board. "
     if ships(path):
         remedy += (
             f"This job ships with the program: `cell init FOLDER --job {path.stem}` writes {path.name} for you to "
-            f'change. Below [board] in it write spec = "{right}", and go on with '
+            f'change. Below {where} in it write spec = "{right}", and go on with '
             f"`cell commission --job FOLDER/{path.name}`."
         )
     else:
-        remedy += f'Below [board] in {path} it has to read spec = "{right}".'
+        remedy += f'Below {where} in {path} it has to read spec = "{right}".'
     result.find(
         "board.spec of the job", "the station's board has another pitch than its name says, by the ways of the arm",
         f"{1e3 * board.pitch:g} mm", f"{1e3 * board.pitch * across:.1f} mm", remedy,
-        write_job={} if ships(path) else {"board.spec": f'"{right}"'},
+        write_job={} if ships(path) or stop else {"board.spec": f'"{right}"'},
     )  # fmt: skip
 
 

@@ -22,14 +22,10 @@ pytestmark = pytest.mark.usefixtures("here")
 
 MOVING = (["run"], ["home"], ["jog", "rail", "+5mm"], ["calibrate"], ["calibrate", "verify"], ["diag"])
 ENDPOINTS = {
-    "speed": 3.0,
-    "truth": {"address": "127.0.0.1:4001"},
-    "arm": {"address": "127.0.0.2"},
-    "rail": {"url": "socket://127.0.0.1:4002"},
-    "vehicle": {"interface": "slcan", "channel": "socket://127.0.0.1:4003"},
-    "scan_camera": {"address": "127.0.0.1:4004"},
-    "target_camera": {"address": "127.0.0.1:4005"},
-}
+    "speed": 3.0, "truth": {"address": "127.0.0.1:4001"}, "arm": {"address": "127.0.0.2"},
+    "rail": {"url": "socket://127.0.0.1:4002"}, "vehicle": {"interface": "slcan", "channel": "socket://127.0.0.1:4003"},
+    "scan_camera": {"address": "127.0.0.1:4004"}, "target_camera": {"address": "127.0.0.1:4005"},
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("words", MOVING, ids=" ".join)

@@ -20,12 +20,8 @@ def test_people_see_values_and_records_without_what_is_too_long(capsys):
     lines = capsys.readouterr().out.splitlines()
     shown = [[cell.strip() for cell in line.strip("│").split("│")] for line in lines if line.startswith("│")]
     assert shown == [
-        ["seeds", "20"],
-        ["place_mm mean", "0.07213"],
-        ["place_mm limit", ""],
-        ["dots", "1"],
-        ["tags", "0.9876"],
-    ]
+        ["seeds", "20"], ["place_mm mean", "0.07213"], ["place_mm limit", ""], ["dots", "1"], ["tags", "0.9876"],
+    ]  # fmt: skip
 
 
 def test_scripts_get_all_of_it(capsys):

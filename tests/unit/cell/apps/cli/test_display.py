@@ -16,13 +16,9 @@ from tests.support import Typed, report_runs
 from tests.support.report_runs import NAMES, Ended, Ends, Make
 
 MAKES: list[tuple[Make, str]] = [
-    (report_runs.placed, "placed"),
-    (report_runs.real, "placed"),
-    (report_runs.no_board, "refused"),
-    (report_runs.too_strict, "refused"),
-    (report_runs.faulted, "faulted"),
-    (report_runs.aborted, "aborted"),
-]
+    (report_runs.placed, "placed"), (report_runs.real, "placed"), (report_runs.no_board, "refused"),
+    (report_runs.too_strict, "refused"), (report_runs.faulted, "faulted"), (report_runs.aborted, "aborted"),
+]  # fmt: skip
 CALIBRATION = {
     "kind": "calibration", "outcome": "done", "reason": "stored", "started": "2026-03-01T10:00:00+0100",
     "ended": "2026-03-01T10:02:05+0100", "wall_s": 125.0,

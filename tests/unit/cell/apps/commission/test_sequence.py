@@ -168,6 +168,6 @@ def test_what_a_person_would_not_do_is_not_good(tmp_path, monkeypatch, check: st
     made = opened(tmp_path, Shown())
     with closing(made.workplace):
         monkeypatch.setattr(made.workplace, "simulated", False)
-        monkeypatch.setattr(made.workplace.person, "_ask", lambda text: not text.startswith(("Keep", "Press")))
+        monkeypatch.setattr(made.workplace.person, "_ask", lambda text: not text.startswith(("Keep", "Joint 1")))
         with pytest.raises(RefusedError, match="not tried"):
             by_name(check).work(made.workplace, Result())

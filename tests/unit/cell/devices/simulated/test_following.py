@@ -33,17 +33,10 @@ AIR = {
 }
 CAMERAS = "scan_camera,target_camera"
 MIXES = (
-    "scan_camera,laser",
-    "scan_camera,claw",
-    f"{CAMERAS},laser",
-    f"{CAMERAS},vehicle",
-    "scan_camera,rail,laser",
-    f"{CAMERAS},arm,laser,claw",
-    f"{CAMERAS},arm,vehicle,laser,claw",
-    f"{CAMERAS},rail,vehicle,laser,claw",
-    f"{CAMERAS},arm,rail,laser,claw",
-    "claw",
-)
+    "scan_camera,laser", "scan_camera,claw", f"{CAMERAS},laser", f"{CAMERAS},vehicle", "scan_camera,rail,laser",
+    f"{CAMERAS},arm,laser,claw", f"{CAMERAS},arm,vehicle,laser,claw", f"{CAMERAS},rail,vehicle,laser,claw",
+    f"{CAMERAS},arm,rail,laser,claw", "claw",
+)  # fmt: skip
 
 
 def test_pictures_follow_a_real_rail_and_there_are_none_while_nobody_knows_where_it_is(tmp_path):

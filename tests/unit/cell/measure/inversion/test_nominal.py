@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial import cKDTree
 
+from cell.config.job import load_job
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.nominal import MOST_SAMPLES, _samples, read_mesh
 from drivers.errors import ConfigError
@@ -55,3 +57,12 @@ def test_a_tube_of_long_thin_triangles_has_no_more_samples_than_another_mesh():
     corners = np.concatenate([np.stack(strip, axis=1) for strip in strips])
     areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     assert len(_samples(corners, areas)[0]) < 5 * MOST_SAMPLES
+
+
+def test_a_mesh_whose_end_is_missing_is_refused(tmp_path):
+    whole, cut = tmp_path / "whole.ply", tmp_path / "cut.ply"
+    trimesh.load_mesh(load_job("pot")[1], process=False).export(whole, encoding="ascii")
+    cut.write_text(whole.read_text()[: -whole.stat().st_size // 10])
+    read_mesh(whole, "m")
+    with pytest.raises(ConfigError, match=r"cut\.ply is cut: it holds \d+ of 7600 triangles; copy it again"):
+        read_mesh(cut, "m")

@@ -27,13 +27,6 @@ def test_what_init_writes_passes_the_check_and_is_not_overwritten(here: Path, jo
 
 def test_a_job_whose_files_init_cannot_keep_apart_is_refused_before_anything_is_written(here: Path):
     CliRunner().invoke(app, ["init", "own", "--job", "pot"])
-    text = (here / "own" / "pot.toml").read_text()
-    (here / "own" / "cell.toml").write_text(text)
-    (here / "own" / "sub").mkdir()
-    (here / "own" / "pot.ply").rename(here / "own" / "sub" / "pot.ply")
-    (here / "own" / "pot.toml").write_text(text.replace('"pot.ply"', '"sub/pot.ply"'))
-    refused = CliRunner().invoke(app, ["init", "other", "--job", "own/pot.toml"])
-    assert "does not lie beside" in str(refused.exception)
-    (here / "own" / "sub" / "pot.ply").rename(here / "own" / "pot.ply")
+    (here / "own" / "cell.toml").write_text((here / "own" / "pot.toml").read_text())
     refused = CliRunner().invoke(app, ["init", "other", "--job", "own/cell.toml"])
     assert "give the job another name" in str(refused.exception) and not (here / "other").exists()

@@ -2,6 +2,9 @@
 
 from contextlib import closing
 
+from typer.testing import CliRunner
+
+from cell.apps.cli.app import app
 from cell.apps.commission.check import Result
 from cell.apps.commission.checks.vehicle import judge_board
 from cell.apps.commission.sequence import by_name
@@ -27,3 +30,11 @@ def test_a_station_board_of_another_pitch_is_written_into_a_job_of_ones_own_and_
             assert made.progress.standing(check, made.workplace.config) == ("stale" if written else "good")
     assert load_job(job)[0].board.spec == "marked_dots:9x7:24mm"
     assert len(list(job.parent.glob("own.toml.before-*"))) == 1
+
+
+def test_the_board_of_one_of_several_stops_is_left_to_a_person(here):
+    CliRunner().invoke(app, ["init", "own", "--job", "two-stations"])
+    job, result = "own/two-stations.toml#2", Result()
+    judge_board(job, parse_board(load_job(job)[0].board.spec), 1.201, result)
+    (finding,) = result.findings
+    assert not finding.write_job and "or the board of stop right, in " in finding.remedy

@@ -20,18 +20,12 @@ from tests.support.report_runs import CONFIG, pot
 
 VEHICLE = CONFIG.arm.vehicle_from_base.se3().inverse()
 NAMES = {
-    "mode hop": ("laser", "the laser jumped by"),
-    "frames one late": ("along", "the frames come 1 late"),
-    "lost count": ("along", "the carriage jumped against its count"),
-    "slow sway": ("sway", "the vehicle rocks at"),
-    "creep": ("drift", "creeps"),
-    "pushed": ("push", "was pushed at line"),
-    "oil": ("patch", "oil, water or a reflection"),
-    "wide film": ("patch", "oil, dirt"),
-    "wear": ("patch", "wear, a dent"),
-    "bent": ("bent", "is bent"),
-    "rows": ("rows", "of the camera's rows"),
-}
+    "mode hop": ("laser", "the laser jumped by"), "frames one late": ("along", "the frames come 1 late"),
+    "lost count": ("along", "the carriage jumped against its count"), "slow sway": ("sway", "the vehicle rocks at"),
+    "creep": ("drift", "creeps"), "pushed": ("push", "was pushed at line"),
+    "oil": ("patch", "oil, water or a reflection"), "wide film": ("patch", "oil, dirt"),
+    "wear": ("patch", "wear, a dent"), "bent": ("bent", "is bent"), "rows": ("rows", "of the camera's rows"),
+}  # fmt: skip
 """What each effect is to be called: its kind and the words that say so."""
 
 

@@ -29,18 +29,13 @@ def with_rivals() -> np.ndarray:
 
 
 PICTURES = {
-    "a stripe": stripe(2.0, 150.0),
-    "a faint stripe": stripe(1.2, 20.0),
-    "coarse speckle": stripe(3.0, 220.0, 0.5),
-    "a saturated stripe": stripe(2.0, 900.0),
-    "rivals": with_rivals(),
+    "a stripe": stripe(2.0, 150.0), "a faint stripe": stripe(1.2, 20.0), "coarse speckle": stripe(3.0, 220.0, 0.5),
+    "a saturated stripe": stripe(2.0, 900.0), "rivals": with_rivals(),
     "a stripe at the border": np.roll(stripe(2.0, 150.0), SHAPE[1] // 2, axis=1),
     "jumps": np.stack([np.roll(line, 97 * k) for k, line in enumerate(stripe(2.0, 150.0))]),
-    "nothing but noise": noise(20.0),
-    "anything": np.random.default_rng(4).integers(0, 256, SHAPE).astype(np.uint8),
-    "white": np.full(SHAPE, 255, np.uint8),
-    "a small picture": noise(30.0, (40, 33)),
-}
+    "nothing but noise": noise(20.0), "anything": np.random.default_rng(4).integers(0, 256, SHAPE).astype(np.uint8),
+    "white": np.full(SHAPE, 255, np.uint8), "a small picture": noise(30.0, (40, 33)),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("with_dark", [False, True])
