@@ -261,7 +261,7 @@ def write_protocol(progress: Progress, checks: Sequence[CommissionCheck], config
 
 def _row(progress: Progress, check: CommissionCheck, standing: str) -> ProtocolRow:
     result = progress.result(check.name)
-    kept = result or {"readings": [], "pictures": []}
+    kept = {"readings": [], "pictures": [], **(result or {})}
     readings = [Reading(row["what"], row["value"], row["unit"], row["least"], row["most"]) for row in kept["readings"]]
     pictures = [path for name in kept["pictures"] if (path := progress.folder / name).is_file()]
     return ProtocolRow(check, standing, result, [(reading, bounds(reading)) for reading in readings], pictures)

@@ -54,7 +54,7 @@ def edited(text: str, changes: Mapping[str, str]) -> str:
 def write_changes(path: Path, changes: Mapping[str, str]) -> Path:
     """Change the file, and keep the old one beside it; returns where that is. `ConfigError` when it cannot be done."""
     try:
-        new = edited(path.read_text(encoding="utf-8"), changes)
+        new = edited(path.read_bytes().decode("utf-8-sig"), changes)
         stamp = time.strftime("%Y%m%d-%H%M%S")
         names = [f"{path.name}.before-{stamp}", *(f"{path.name}.before-{stamp}-{k}" for k in range(2, 100))]
         backup = next(path.with_name(name) for name in names if not path.with_name(name).exists())

@@ -151,15 +151,15 @@ def new_job(
         "grasp-sigma": grasp_sigma, "grasp-sigma-angle": grasp_sigma_angle, "tolerance": tolerance,
         "tolerance-angle": tolerance_angle, "step": step,
     }  # fmt: skip
-    told: list[str] = []
+    told, source = list[str](), find_config(config, simulated=True)
 
     def notify(text: str) -> None:
         told.append(text)
         if not json:
             typer.echo(text)
 
-    source = find_config(config, simulated=True)
     asker = Asker(given, None if yes else partial(typer.prompt, err=json), notify)
+    asker.used |= {name: str(at) for name, at in (("config", config), ("folder", folder)) if at not in (None, Path())}
     made = make_job(asker, load_config(source), folder, overwrite)
     if json:
         known = {"seen": round(made.seen, 3), "expected": made.place.summary(), "notes": list(made.notes), "told": told}

@@ -128,12 +128,13 @@ def test_what_cannot_be_changed_without_risk_is_refused_with_what_to_write(monke
 
 def test_the_old_file_is_kept_each_time(tmp_path):
     path = tmp_path / "cell.toml"
-    path.write_text(default_toml(), encoding="utf-8")
+    path.write_bytes(default_toml().replace("\n", "\r\n").encode())
     kept = [write_changes(path, {"rail.lead": f'"{k} mm"'}) for k in (3, 4)]
     assert len(set(kept)) == 2
     assert kept[0].read_text(encoding="utf-8") == default_toml()
     assert 'lead = "3 mm"' in kept[1].read_text(encoding="utf-8")
     assert load_config(path).rail.lead == pytest.approx(0.004)
+    assert path.read_bytes().count(b"\r\n") == path.read_bytes().count(b"\n")
 
 
 def test_every_check_says_what_moves_and_needs_only_earlier_ones():
