@@ -32,7 +32,10 @@ def test_growth_is_that_of_the_jobs_after_the_first_and_one_odd_job_makes_none()
 
 
 def test_what_this_program_has_started_is_counted_under_its_name():
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+    program = [sys.executable, "-c", "print(flush=True); input()"]
+    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        child.stdout.readline()  # before this it is a fork of ours, or holds nothing yet
         assert child.pid in descendants(os.getpid())
         found = counted(os.getpid())
         assert set(found) >= {"this program", Path(sys.executable).name}
