@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from cell.devices.gate.gate import Gate
@@ -109,7 +110,7 @@ class Devices:
         return (getattr(self, f"_{name}") for name in order if name in self)
 
     def stop(self) -> list[str]:
-        """Laser off, vehicle stopped and braked, rail and arm stopped; none waits for another to confirm it.
+        """Laser and outputs that are tried off, vehicle braked, rail and arm stopped; none waits for another.
 
         Whoever works with the devices now cannot begin anything new with them. Returns what could not be confirmed, a
         line each; an empty list means that everything answered.
@@ -118,12 +119,15 @@ class Devices:
         actions: dict[str, Callable[[], None]] = {}
         if self._laser is not None:
             actions["laser off"] = self._laser.stop
+        # On a virtual clock one comes after another: outputs go off at once, and the arm is the one that may touch.
+        if self._arm is not None:
+            for output in self.interlocks.tried_outputs:
+                actions[f"output {output} off"] = partial(self._arm.set_digital_output, output, False)
+            actions["arm stopped"] = self._arm.stop
         if self._vehicle is not None:
             actions["vehicle stopped and braked"] = self._vehicle.brake
         if self._rail is not None:
             actions["rail stopped"] = self._rail.stop
-        if self._arm is not None:
-            actions["arm stopped"] = self._arm.stop
         return waiting_on(self.clock).each(actions, SAFE_STOP_TIMEOUT_S)
 
     def close(self) -> list[str]:

@@ -223,11 +223,13 @@ class DirectArm(DirectDevice):
 
     def zero_force(self) -> None:
         """Take the present wrench as zero."""
+        self._require_well()
         self.model.zero_force()
 
     def set_payload(self, mass: float, centre: Vector) -> None:
         """Tell the model what it carries."""
         mass, offset = self._limits.check_payload(self.name, mass, centre)
+        self._require_well()
         self.model.payload = (mass, np.array(offset))
 
     def set_digital_output(self, index: int, value: bool) -> None:
@@ -267,15 +269,15 @@ class DirectArm(DirectDevice):
             if self._stops != stops:
                 raise Aborted(f"{self.name}: stopped while it was recovered")
             self.model.unlock()
-        if (found := self.trouble()) is not None:
-            raise found
+        self._require_well()
         self._motion = None
 
     def stop(self) -> None:
-        """Brake now, and wait until the arm stands."""
+        """Brake now, unless the safety system brakes already, and wait until the arm stands."""
         self._stops += 1
         self.end_motion(Aborted(f"{self.name}: stopped before the end of its motion"))
-        self.model.start(StopMotion(_BRAKING))
+        if self.model.safety is Safety.NORMAL:
+            self.model.start(StopMotion(_BRAKING))
         while self.model.moving:
             self.clock.sleep(TICK_S)
 
@@ -326,10 +328,13 @@ class DirectArm(DirectDevice):
             which = "0-7 standard, 8-15 configurable, 16-17 tool"
             raise LimitError(self.name, f"digital input or output {index} does not exist: {which}")
 
-    def _require_free(self) -> None:
+    def _require_well(self) -> None:
         self._require_remote()
         if (found := self.trouble()) is not None:
             raise found
+
+    def _require_free(self) -> None:
+        self._require_well()
         if self._motion is not None and not self._motion.done:
             raise InterlockError(self.name, "a motion is still under way; nothing was sent. Wait for it or stop it.")
 

@@ -106,7 +106,7 @@ class VirtualClock(Clock):
             if self._time.now() >= until:
                 return False
             self._tick(until)
-        for ring in [ring for ring, due in self._alarms.items() if due <= self._time.now()]:
+        for ring in [ring for ring, due in list(self._alarms.items()) if due <= self._time.now()]:
             # One that waits lets others ring.
             if self._alarms.pop(ring, None) is None:
                 continue

@@ -128,8 +128,9 @@ class DirectVehicle(DirectDevice):
             self._braked = True
 
     def close(self) -> None:
-        """Stop."""
-        self.stop()
+        """Stop and brake, unless nobody ever commanded it."""
+        if self._enabled:
+            self.brake()
 
     @property
     def tick_s(self) -> float:

@@ -96,9 +96,9 @@ class Kinematics:
                 return np.where(q > limit, q - 2 * math.pi, np.where(q < -limit, q + 2 * math.pi, q))
         return None
 
-    def refine(self, target: Matrix, q: Vector, tolerance: float = 1e-9) -> Vector | None:
+    def refine(self, target: Matrix, q: Vector) -> Vector | None:
         """Joint angles (6,) for a `target` (4, 4) close to where `q` stands, without leaving its branch; else None."""
-        return self._descend(target, q, tolerance, iterations=8)
+        return self._descend(target, q, 1e-9, iterations=8)
 
     def _descend(self, target: Matrix, q: Vector, tolerance: float, iterations: int = 60) -> Vector | None:
         milestone = math.inf

@@ -17,10 +17,13 @@ Image = NDArray[np.float32]
 
 def render(
     optics: CameraOptics, scene: Sequence[SceneObject], laser: LaserOptics | None, exposure: float,
-    rng: np.random.Generator, light: Light | None = None,
+    rng: np.random.Generator, light: Light | None = None, speckle: np.random.Generator | None = None,
 ) -> NDArray[np.uint8]:  # fmt: skip
-    """Picture (height, width) uint8 that the camera takes of `scene` with `exposure` seconds; `laser` None is off."""
-    return sensor(expected_image(optics, scene, laser, exposure=exposure, rng=rng, light=light), optics, rng)
+    """Picture (height, width) uint8 that the camera takes of `scene` with `exposure` seconds; `laser` None is off.
+
+    `speckle` draws the laser's speckle, which stays as it is while nothing moves; None: `rng`.
+    """
+    return sensor(expected_image(optics, scene, laser, exposure, speckle or rng, light=light), optics, rng)
 
 
 def expected_image(

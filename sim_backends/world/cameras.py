@@ -4,6 +4,7 @@ Poses come in, pictures go out; time and motion are the world's business.
 """
 
 import threading
+import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -40,6 +41,8 @@ WITNESS_ALBEDO = 0.5
 SURFACE_ALBEDO = 0.6
 BOW_AT = (0.130, 0.018)
 """Where the sheet's bow is told: from the laser, and beside the fan's middle, m."""
+SPECKLE_M = 10e-6
+"""The speckle stays the same as long as the camera stands still, to so much."""
 SUN_SPEED = 0.2e-3
 """m/s: a quarter of a degree a minute, from a window 3 m away."""
 OUTSIDE_M = 1.5
@@ -115,7 +118,10 @@ class Cameras:
             objects += [seen for station, at in parts for seen in self._part(station, camera_from_world @ at)]
         with self._busy[camera]:
             lit = self.laser(warm) if laser and camera == "scan" else None
-            return render(optics, objects, lit, exposure, self._rng[camera], light=self._lit(camera_from_world, t))
+            still = np.rint(camera_from_world[:3] / SPECKLE_M).astype(np.int64)
+            speckle = np.random.default_rng([self._shown[0].seed, zlib.crc32(still.tobytes())])
+            light = self._lit(camera_from_world, t)
+            return render(optics, objects, lit, exposure, self._rng[camera], light=light, speckle=speckle)
 
     def _witness(self, camera_from_flange: Pose) -> list[SceneObject]:
         """The plate on the claw, if the camera sees any of it."""

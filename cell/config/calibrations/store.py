@@ -68,7 +68,6 @@ def require_valid(calibration: "CellCalibration") -> None:
     _require("scan.rail_direction, its length", np.linalg.norm(scan.rail_direction), *SCALE_RANGE)
     if (witness := scan.witness) is not None:
         _require("scan.witness.rail, m", witness.rail, -10.0, 10.0)
-        _require("scan.witness.sigma, px", witness.sigma[witness.rows], 1e-9, 1e3)
 
 
 def require_covariance(name: str, covariance: Array, fixed: range) -> None:

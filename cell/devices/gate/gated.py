@@ -195,11 +195,18 @@ class GatedArm(Gated[interfaces.Arm]):
         self.bare.set_payload(mass, centre)
 
     def set_digital_output(self, index: int, value: bool) -> None:
-        """See `Arm.set_digital_output`. A laser, or what may be one, is switched off also after a stop."""
+        """See `Arm.set_digital_output`. A laser, or what may be one, is switched off also after, and by, a stop."""
         command = DeviceCommand("arm", "set_digital_output", {"index": index, "value": value})
-        if value or not self.gate.interlocks.may_be_laser(index):
-            self.gate.require(command)
-        self.bare.set_digital_output(index, value)
+        laser = self.gate.interlocks.may_be_laser(index)
+
+        def off() -> None:
+            if laser:
+                self.bare.set_digital_output(index, False)
+
+        if value or not laser:
+            self.gate.begin(command, lambda: self.bare.set_digital_output(index, value), off)
+        else:
+            off()
 
     def digital_input(self, index: int) -> bool:
         return self.bare.digital_input(index)
@@ -304,17 +311,14 @@ class GatedClaw(Gated[interfaces.Claw]):
     """The claw, closed and opened through a gate; what it did is not undone, because that could drop the part."""
 
     def grip(self, timeout: float = 2.0) -> None:
-        self._begin("grip", lambda: self.bare.grip(timeout))
+        self.gate.begin(DeviceCommand("claw", "grip"), lambda: self.bare.grip(timeout), lambda: None)
 
     def release(self, timeout: float = 2.0) -> None:
-        self._begin("release", lambda: self.bare.release(timeout))
-        self.gate.interlocks.carry(())
+        def start() -> None:
+            self.bare.release(timeout)
+            self.gate.interlocks.carry(())
 
-    def _begin(self, name: str, start: Callable[[], None]) -> None:
-        self.gate.require(DeviceCommand("claw", name))
-        # The rules may have waited for a reading, and a stop have come meanwhile.
-        self.gate.require()
-        start()
+        self.gate.begin(DeviceCommand("claw", "release"), start, lambda: None)
 
     @property
     def holding(self) -> bool:

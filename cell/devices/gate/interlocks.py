@@ -149,6 +149,11 @@ class Interlocks:
         """Whether this output of the arm is switched off at any time, because a laser hangs on it or might."""
         return self.situation.outputs.get(output) == "laser" or output in self._tried
 
+    @property
+    def tried_outputs(self) -> tuple[int, ...]:
+        """The arm's outputs of which nobody knows now what hangs on them."""
+        return tuple(self._tried)
+
     @contextmanager
     def purpose(self, name: str) -> Iterator[None]:
         """Inside this context this thread may light the laser, for one of `PURPOSES`; `ConfigError` for another."""

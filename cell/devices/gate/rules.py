@@ -95,10 +95,12 @@ def _moves(now: Situation, state: ArmState) -> str | None:
     return None
 
 
+def _at_rest(now: Situation, command: DeviceCommand) -> str | None:
+    return None if now.arm is None else _moves(now, now.arm.state(TIMEOUT_S))
+
+
 def _still(now: Situation, command: DeviceCommand) -> str | None:
-    if now.arm is None:
-        return None
-    if (against := _moves(now, now.arm.state(TIMEOUT_S))) is not None:
+    if (against := _at_rest(now, command)) is not None:
         return against
     if now.last is not None and now.last.contact:
         return "the arm's last motion ended at contact, and it may still touch something. Move it away first"
@@ -230,6 +232,7 @@ RULES = (
     ),
     Rule("laser_off_to_drive", ("vehicle.enable", "vehicle.drive"), "the laser is off", _dark),
     Rule("laser_purpose", ("laser.lit",), f"it was said what for: {', '.join(PURPOSES)}", _purpose),
+    Rule("claw_at_rest", ("claw.grip", "claw.release"), "the arm, where it is connected, is at rest", _at_rest),
     Rule(
         "claw_at_contact", ("claw.release",),
         "the arm still stands where its last motion ended at contact, or the claw shows no part; else a person's word",

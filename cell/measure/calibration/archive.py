@@ -93,7 +93,7 @@ def write_archive(path: Path, observations: Observations) -> None:
     arrays["scan_same_rest"] = np.array([s.same_rest for s in o.scan], dtype=np.bool_)
     arrays |= _profiles([s.profile for s in o.scan])
     if o.witness is not None:
-        arrays |= {"witness_columns": o.witness.columns, "witness_sigma": o.witness.sigma}
+        arrays["witness_columns"] = o.witness.columns
         about["witness_rail"] = o.witness.rail
         about["witness_edge"] = None if o.witness.edge is None else vars(o.witness.edge)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -159,10 +159,10 @@ def _arrays(path: Path, advice: str) -> dict[str, Any]:
 def _read_witness(data: Mapping[str, Any], about: Mapping[str, Any]) -> PlateLine | None:
     if "witness_rail" not in about:
         return None
-    columns, sigma = (np.asarray(data[name], dtype=np.float64) for name in ("witness_columns", "witness_sigma"))
-    if columns.ndim != 1 or columns.shape != sigma.shape or not (sigma[np.isfinite(columns)] > 0).all():
-        raise ValueError("the witness needs a deviation above 0 for each of its columns")
-    return PlateLine(float(about["witness_rail"]), columns, sigma, read_edge(about.get("witness_edge")))
+    columns = np.asarray(data["witness_columns"], dtype=np.float64)
+    if columns.ndim != 1:
+        raise ValueError(f"the witness needs one column for each row, not an array of shape {columns.shape}")
+    return PlateLine(float(about["witness_rail"]), columns, read_edge(about.get("witness_edge")))
 
 
 def _views(camera: str, views: Sequence[tuple[BoardView | None, pin.SE3, str]]) -> dict[str, Any]:

@@ -25,8 +25,7 @@ _STATES = {
     RuntimeState.PAUSED: "PAUSED", RuntimeState.RESUMING: "PLAYING",
 }  # fmt: skip
 _FIXED = {
-    "close safety popup": "closing safety popup", "restart safety": "Restarting safety", "quit": "Disconnected",
-    "shutdown": "Shutting down", "savelog": "Log saved to disk",
+    "close safety popup": "closing safety popup", "quit": "Disconnected", "shutdown": "Shutting down", "savelog": "Log saved to disk",
 }  # fmt: skip
 _FOR_REMOTE_ONLY = frozenset(["play", "pause", "stop", "shutdown", "load", "power", "brake", "unlock", "restart"])
 """First words of what is refused in local control."""
@@ -94,8 +93,6 @@ class DashboardServer:
         if word.startswith("generate flight report"):
             self._reports += 1
             return f"Flight Report generated with id: {self._reports}"
-        if word.startswith("generate support file"):
-            return f"Error: {command[22:].strip() or 'no folder'} cannot be written to"
         return f'could not understand: "{command}"'
 
     def _name(self) -> str:

@@ -93,30 +93,27 @@ class Edge:
 
 @dataclass(frozen=True, eq=False)
 class PlateLine:
-    """The line on the plate with the rail at `rail` m: its column (height,) in px, NaN where it is not seen, and the
-    standard deviation `sigma` (height,) of each; `edge` of the plate, where one was found."""
+    """The line on the plate with the rail at `rail` m: its column (height,) in px, NaN where it is not seen; `edge` of
+    the plate, where one was found."""
 
     rail: float
     columns: Array
-    sigma: Array
     edge: Edge | None = None
 
     def as_dict(self) -> dict[str, object]:
         """For storage."""
         rows = self.rows
-        values = {"columns": self.columns[rows].tolist(), "sigma": self.sigma[rows].tolist()}
-        edge = None if self.edge is None else vars(self.edge)
-        return {"rail": self.rail, "height": len(self.columns), "rows": rows.tolist(), **values, "edge": edge}
+        where = {"height": len(self.columns), "rows": rows.tolist(), "columns": self.columns[rows].tolist()}
+        return {"rail": self.rail, **where, "edge": None if self.edge is None else vars(self.edge)}
 
     @classmethod
     def read(cls, data: dict[str, Any] | None) -> Self | None:
         """From storage; KeyError, TypeError, ValueError or IndexError when it is none."""
         if data is None:
             return None
-        columns, sigma = np.full((2, int(data["height"])), np.nan)
-        rows = np.array(data["rows"], dtype=np.intp)
-        columns[rows], sigma[rows] = data["columns"], data["sigma"]
-        return cls(float(data["rail"]), columns, sigma, read_edge(data.get("edge")))
+        columns = np.full(int(data["height"]), np.nan)
+        columns[np.array(data["rows"], dtype=np.intp)] = data["columns"]
+        return cls(float(data["rail"]), columns, read_edge(data.get("edge")))
 
     @property
     def rows(self) -> NDArray[np.intp]:

@@ -124,7 +124,7 @@ ROWS[100:200] = 300.0
         (_scan(rail_direction=np.array([1000.0, 0.0, 0.0])), r"its length: 1000, allowed 0\.98 to 1\.02"),
         (_scan(flange_from_camera=pin.SE3(np.eye(3), np.array([90.0, 0, 0]))), "flange_from_camera, m: 90"),
         (_scan(confirmed=ConfirmedTurn(0.0, 0.0, 1e-5, 4.07e9)), "confirmed.made lies .* hours in the future"),
-        (_scan(witness=PlateLine(0.0, ROWS, 0.0 * ROWS)), r"witness\.sigma"),
+        (_scan(witness=PlateLine(11.0, ROWS)), r"witness\.rail"),
         (replace(made(), target=replace(made().target, hand_eye_covariance=np.zeros((6, 6)))), "hand_eye_covariance"),
         (replace(made(), made=4.07e9), "hours in the future"),
         (replace(made(), made=0.0), "no date"),

@@ -86,6 +86,20 @@ def test_after_a_stop_an_output_that_is_the_lasers_can_still_be_switched_off_and
     assert [arm.state().digital_outputs >> output & 1 for output in (7, laser)] == [1, 0]
 
 
+def test_an_output_that_is_tried_goes_off_again_when_a_stop_comes_as_it_is_switched_on(monkeypatch):
+    devices = VirtualCell(CONFIG, seed=4, level="ideal").devices
+    arm, switch = devices.arm, devices.arm.bare.set_digital_output
+
+    def stopped(index: int, value: bool) -> None:
+        devices.gate.shut()
+        switch(index, value)
+
+    monkeypatch.setattr(arm.bare, "set_digital_output", stopped)
+    with devices.interlocks.tried(7), pytest.raises(InterlockError, match="after_a_stop"):
+        arm.set_digital_output(7, True)
+    assert not arm.state().digital_outputs >> 7 & 1
+
+
 def test_a_stop_that_comes_while_a_rule_of_the_claw_waits_leaves_the_part_held():
     """What a claw does cannot be undone without dropping the part, so it is looked again before it is told."""
 

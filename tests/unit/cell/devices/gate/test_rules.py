@@ -101,6 +101,9 @@ def test_an_arm_that_turns_any_joint_either_way_is_not_stowed(joint: int, speed:
         rules(arm=turning).require(DRIVE)
     with pytest.raises(InterlockError, match=r"the arm moves.*arm_still"):
         rules(arm=turning).require(DeviceCommand("vehicle", "enable"))
+    for command in ("grip", "release"):
+        with pytest.raises(InterlockError, match=r"the arm moves.*claw_at_rest"):
+            rules(arm=turning).require(DeviceCommand("claw", command))
 
 
 def test_an_arm_whose_motion_is_not_over_is_not_stowed_though_it_stands():

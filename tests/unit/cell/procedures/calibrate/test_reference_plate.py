@@ -197,7 +197,7 @@ def test_a_slip_across_is_told_only_where_the_picture_holds_both_ends_of_the_lin
         lit = np.flatnonzero((across + head > low) & (across + head < high))[5:-5]
         columns = np.full(480, np.nan)
         columns[lit] = 200.0
-        return PlateLine(0.0, columns, np.full(480, 0.05), Edge(0.005, 0.0))
+        return PlateLine(0.0, columns, Edge(0.005, 0.0))
 
     plane = LightPlane.from_baseline(0.035, np.arctan(3.5))
     slip = slip_since(plate(0.0), plate(0.14e-3), camera, plane, np.array([1.0, 0.0, 0.0]))

@@ -48,12 +48,14 @@ def test_after_a_stop_a_script_begins_nothing_until_a_person_says_so(cell: Cell)
     assert rail.state().position == pytest.approx(0.02, abs=1e-6)
 
 
-def test_an_output_that_may_be_the_lasers_is_switched_off_after_a_stop_while_it_is_tried(cell: Cell):
+def test_an_output_that_may_be_the_lasers_is_switched_off_by_a_stop_and_after_it_while_it_is_tried(cell: Cell):
     """Where the numbers of laser and claw are swapped in the configuration, the claw's output lights the laser."""
     arm, claw = cell.devices.arm, CONFIG.claw.output
     with cell.maintenance("what hangs on which output", ["own_switch"]), cell.devices.interlocks.tried(claw):
         arm.set_digital_output(claw, True)
         cell.stop()
+        assert not arm.state().digital_outputs >> claw & 1
+        arm.bare.set_digital_output(claw, True)
         arm.set_digital_output(claw, False)
         assert not arm.state().digital_outputs >> claw & 1
     refused("after_a_stop", lambda: arm.set_digital_output(7, False), "clear_stop(by)")

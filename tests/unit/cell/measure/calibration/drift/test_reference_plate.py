@@ -48,7 +48,7 @@ def seen(
     columns = np.full(480, np.nan)
     columns[found.rows] = found.columns + shift + SIGMA * np.random.default_rng(seed).standard_normal(len(found.rows))
     columns[rows:] = np.nan
-    return PlateLine(0.0, columns, np.full(480, SIGMA))
+    return PlateLine(0.0, columns)
 
 
 def wall(laser: LaserOptics, now: LightPlane, shift: float = 0.0) -> list[Array]:
