@@ -25,7 +25,8 @@ _STATES = {
     RuntimeState.PAUSED: "PAUSED", RuntimeState.RESUMING: "PLAYING",
 }  # fmt: skip
 _FIXED = {
-    "close safety popup": "closing safety popup", "quit": "Disconnected", "shutdown": "Shutting down", "savelog": "Log saved to disk",
+    "close safety popup": "closing safety popup", "restart safety": "Restarting safety", "quit": "Disconnected",
+    "shutdown": "Shutting down", "savelog": "Log saved to disk",
 }  # fmt: skip
 _FOR_REMOTE_ONLY = frozenset(["play", "pause", "stop", "shutdown", "load", "power", "brake", "unlock", "restart"])
 """First words of what is refused in local control."""
