@@ -303,7 +303,7 @@ class PartOnGround:
         (before, around), (now, around_now) = (parted(cloud, self.faces, here) for cloud in (first, second))
         if before.size < LEAST_POINTS:
             return None
-        part = surface_motion(before, now, self.faces, here, (_nothing, _nothing))
+        part = surface_motion(before, now, self.faces, _settled(before, self.faces, here), (_nothing, _nothing))
         if part.matched < LEAST_MATCHED:
             return GATE_M
         motion = part.motion
@@ -321,6 +321,18 @@ class PartOnGround:
         points = self.faces.vertices @ here.rotation.T
         far = float(np.linalg.norm(motion[:3] + np.cross(motion[3:], points), axis=1).mean())
         return far if far > LEAST_MOTION_M else 0.0
+
+
+def _settled(cloud: Cloud, faces: NominalSurface, pose: pin.SE3) -> pin.SE3:
+    """`pose` of the part with these `faces`, base axes, brought to where the cloud shows it."""
+    free = np.array([GATE_M] * 3 + [GATE_M / faces.radius] * 3)
+    for _ in range(MOST_STEPS):
+        seen = _Beside.of(cloud, faces, pose, _nothing)
+        if len(seen.heights) < NEIGHBOURS:
+            break
+        step = _fitted(seen.jacobian, seen.heights, seen.lines, seen.by_poses, free)[0]
+        pose = pin.SE3(pin.exp3(step[3:]) @ pose.rotation, pose.translation + step[:3])
+    return pose
 
 
 def _nothing(lines: Indices, rows: Indices) -> Array:
