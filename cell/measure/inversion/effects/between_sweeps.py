@@ -299,11 +299,18 @@ class PartOnGround:
         `unsure` (6, 6), base axes, is by how much the clouds may lie apart for another reason: times, the arm. Ground
         beside the part tells it better.
         """
-        here = self.base_from_part
+        far = self._moved_from(self.base_from_part, first, second, unsure)
+        if not far:
+            return far
+        # One that lies mm aside seems to move, for other lines show other points of it: it is judged where it lies.
+        return self._moved_from(_settled(first, self), first, second, unsure)
+
+    def _moved_from(self, here: pin.SE3, first: Cloud, second: Cloud, unsure: Array) -> float | None:
+        """As `moved`, for a part that lay `here` (base_from_part)."""
         (before, around), (now, around_now) = (parted(cloud, self.faces, here) for cloud in (first, second))
         if before.size < LEAST_POINTS:
             return None
-        part = surface_motion(before, now, self.faces, _settled(before, self.faces, here), (_nothing, _nothing))
+        part = surface_motion(before, now, self.faces, here, (_nothing, _nothing))
         if part.matched < LEAST_MATCHED:
             return GATE_M
         motion = part.motion
@@ -323,16 +330,17 @@ class PartOnGround:
         return far if far > LEAST_MOTION_M else 0.0
 
 
-def _settled(cloud: Cloud, faces: NominalSurface, pose: pin.SE3) -> pin.SE3:
-    """`pose` of the part with these `faces`, base axes, brought to where the cloud shows it."""
-    free = np.array([GATE_M] * 3 + [GATE_M / faces.radius] * 3)
+def _settled(cloud: Cloud, part: PartOnGround) -> pin.SE3:
+    """base_from_part, brought to where the cloud shows the part."""
+    own, here = parted(cloud, part.faces, part.base_from_part)[0], part.base_from_part
+    free = np.array([GATE_M] * 3 + [GATE_M / part.faces.radius] * 3)
     for _ in range(MOST_STEPS):
-        seen = _Beside.of(cloud, faces, pose, _nothing)
+        seen = _Beside.of(own, part.faces, here, _nothing)
         if len(seen.heights) < NEIGHBOURS:
             break
         step = _fitted(seen.jacobian, seen.heights, seen.lines, seen.by_poses, free)[0]
-        pose = pin.SE3(pin.exp3(step[3:]) @ pose.rotation, pose.translation + step[:3])
-    return pose
+        here = pin.SE3(pin.exp3(step[3:]) @ here.rotation, here.translation + step[:3])
+    return here
 
 
 def _nothing(lines: Indices, rows: Indices) -> Array:
