@@ -71,11 +71,11 @@ class Fit:
 
         The camera would sit in the base's origin; or, turned round, be the flange itself, and the board the base.
         """
-        if not _axes(self.hand.rotation) or np.linalg.norm(self.hand.translation) > OWN_SHARE * self.reach:
+        if not along_axes(self.hand.rotation) or np.linalg.norm(self.hand.translation) > OWN_SHARE * self.reach:
             return False
         if self.setup == "eye_to_hand":
             return True
-        return _axes(self.stands.rotation) and float(np.linalg.norm(self.stands.translation)) < self.reach / 2
+        return along_axes(self.stands.rotation) and float(np.linalg.norm(self.stands.translation)) < self.reach / 2
 
     @property
     def score_scaled(self) -> float:
@@ -129,9 +129,13 @@ def decide(
         reason = (problems or [why_not(first.numbers, first.named, wanted)])[0]
         raise RefusedError(f"the poses of {series[0].name} cannot be read: {reason}; {NAME_IT}")
     best = fits[0]
+    if best.series.by == "order":
+        # What names say holds where it agrees, too: by their order one pose more or less shifts all that follow.
+        named = (f for f in fits if f.series.name == best.series.name and f.series.by != "order")
+        best = next((f for f in named if f.score < AGREES and not _clearly_worse(f, best)), best)
     if not best.score < AGREES:
         raise RefusedError(_none_agrees(fits, pitch))
-    rival = next((f for f in fits[1:] if not _same(f, best, boards)), None)
+    rival = next((f for f in fits if f is not best and not _same(f, best, boards)), None)
     if rival is not None:
         # The same poses in another file are no other meaning.
         rival = next((f for f in fits if f.series is best.series and _same(f, rival, boards)), rival)
@@ -199,6 +203,11 @@ def _question(best: Fit, rival: Fit) -> str:
         option = f"--pose-field {best.series.name} or --pose-field {rival.series.name}"
     elif best.reading != rival.reading:
         option = f"--poses {best.reading.name} or --poses {rival.reading.name}"
+    if rival.score >= AGREES:
+        return (
+            f"the poses agree with the pictures in no way clearly: {best.text} leaves {best.left}, {rival.text} leaves "
+            f"{rival.left}; are some of them in another unit, or of other pictures? Correct them, or take them out"
+        )
     return (
         f"the poses can be read in two ways that agree with the pictures about equally: {best.text} leaves "
         f"{best.left}, {rival.text} leaves {rival.left}; say which with {option}, or add frames with larger turns"
@@ -283,6 +292,6 @@ def _rotation(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> tuple[Ar
     return rotation, turn, kept
 
 
-def _axes(rotation: Array) -> bool:
+def along_axes(rotation: Array) -> bool:
     """True for a rotation (3, 3) that only exchanges axes, or none."""
     return bool(np.all((np.abs(rotation) < OWN_TURN) | (np.abs(rotation) > 1 - OWN_TURN)))

@@ -58,9 +58,12 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     options = options or Options()
     check_reading(options.poses)
     listing = list_folder(folder)
-    pairs = read_pose_pairs(folder)
+    pairs = read_pose_pairs(listing)
     if pairs and (spec is None or not listing.pictures):
-        result = calibrate_pairs(pairs)
+        _require_none_of_pictures(options, folder)
+        result = calibrate_pairs(pairs, options.setup)
+        if listing.pictures:
+            result.notes.append(f"{len(listing.pictures)} pictures were not looked at: --board names no board of them")
         return RecordedResult(frames=result.frames, notes=result.notes) if options.plan else result
     if spec is None or (listing.texts and not listing.pictures):
         raise ConfigError(_what_is_missing(listing))
@@ -76,6 +79,14 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     _from_frames(frames, [*belonging, *late], options, result)
     result.frames = [frame.figures() for frame in frames]
     return result
+
+
+def _require_none_of_pictures(options: Options, folder: Path) -> None:
+    """Raise ConfigError for what a person said that pairs of poses have nothing of."""
+    laser = None if options.laser is LaserChannel.AUTO else "said"
+    of = {"poses": options.poses, "pose-field": options.pose_field, "camera": options.camera, "laser": laser}
+    if given := [f"--{name}" for name, value in of.items() if value is not None]:
+        raise ConfigError(f"{', '.join(given)}: {folder} holds pairs of poses in m, no pictures; leave it out")
 
 
 def _still_strange(strange: Sequence[tuple[str, str]], late: Sequence[Series]) -> list[tuple[str, str]]:

@@ -15,7 +15,7 @@ from drivers.errors import ConfigError
 
 FORM = "it needs width, height, fx, fy, cx, cy and k1 … k3, or camera_matrix and distortion coefficients"
 MATRICES = ("camera_matrix", "K", "mtx", "intrinsic_matrix")
-LENSES = ("distortion_coefficients", "dist_coeffs", "D", "dist", "distortion")
+LENSES = ("distortion_coefficients", "dist_coeffs", "D", "dist", "distortion", "coeffs")
 NEXT = "calibrate the camera with OpenCV's plain model (plumb_bob), or leave --camera out: the pictures then tell it"
 MODELS = ("distortion_model", "camera_model", "model")
 BROWN = re.compile("plumb_bob|radtan|brown(_conrady)?|opencv|pinhole|none|perspective|rational_polynomial")
@@ -75,11 +75,13 @@ def _camera(data: Mapping[str, Any]) -> CameraModel:
     for name in MODELS:
         if name in data and not BROWN.fullmatch(str(data[name]).lower().replace("-", "_")):
             raise ConfigError(f"{name} is {data[name]}, read can be plumb_bob and radtan; {NEXT}")
-    if "fx" in data:
-        values = [float(data.get(name, 0.0)) if name[0] in "kp" else float(data[name]) for name in PARAMETER_NAMES]
+    values = [float(data[name]) for name in PARAMETER_NAMES[:4]] if "fx" in data else _of_matrix(data)
+    if "fx" in data and ("k1" in data or not any(name in data for name in LENSES)):
+        values += [float(data.get(name, 0.0)) for name in PARAMETER_NAMES[4:]]
         further = {name: float(data[name]) for name in FURTHER_TERMS if name in data}
     else:
-        values, further = _of_matrices(data)
+        lens, further = _lens_of_list(data)
+        values += lens
     for name, value in further.items():
         if value != 0.0:
             raise ConfigError(f"{name} is {value:g}: the lens here has k1, k2, p1, p2 and k3 only; {NEXT}")
@@ -88,16 +90,22 @@ def _camera(data: Mapping[str, Any]) -> CameraModel:
     return camera
 
 
-def _of_matrices(data: Mapping[str, Any]) -> tuple[list[float], dict[str, float]]:
-    """Parameters (9) of a camera matrix and a lens's coefficients, and by name the coefficients that follow these."""
-    of, lenses = _key(data, MATRICES), _key(data, LENSES)
-    matrix, lens = _numbers(data[of]).reshape(3, 3), _numbers(data[lenses])
+def _of_matrix(data: Mapping[str, Any]) -> list[float]:
+    """fx, fy, cx and cy of a camera matrix."""
+    of = _key(data, MATRICES)
+    matrix = _numbers(data[of]).reshape(3, 3)
     if matrix[0, 1] or matrix[1, 0] or not np.array_equal(matrix[2], (0, 0, 1)):
         raise ConfigError(f"{of} is {matrix.tolist()}, it must be fx 0 cx, 0 fy cy, 0 0 1; {NEXT}")
-    if len(lens) < LEAST_TERMS and lens.any():
-        raise ConfigError(f"{lenses} has {len(lens)} numbers, k1, k2, p1, p2 and perhaps k3 are needed; {NEXT}")
-    values = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *lens[:5], *np.zeros(max(0, 5 - len(lens)))]
-    return values, {f"{lenses}[{k + 5}]": float(value) for k, value in enumerate(lens[5:])}
+    return [float(v) for v in (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])]
+
+
+def _lens_of_list(data: Mapping[str, Any]) -> tuple[list[float], dict[str, float]]:
+    """k1, k2, p1, p2 and k3 of a lens's coefficients, and by name the coefficients that follow these."""
+    of = _key(data, LENSES)
+    lens = _numbers(data[of]).tolist()
+    if len(lens) < LEAST_TERMS and any(lens):
+        raise ConfigError(f"{of} has {len(lens)} numbers, k1, k2, p1, p2 and perhaps k3 are needed; {NEXT}")
+    return [*lens[:5], *[0.0] * (5 - len(lens))], {f"{of}[{k + 5}]": value for k, value in enumerate(lens[5:])}
 
 
 def _require_possible(camera: CameraModel) -> None:

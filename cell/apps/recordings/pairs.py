@@ -1,6 +1,5 @@
 """The hand-eye from a folder that holds pairs of poses only, flange and board, without pictures."""
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,9 +7,12 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from cell.apps.recordings.agreement import OWN_SHARE, along_axes
 from cell.apps.recordings.consistency import misplacements, odd_turns
 from cell.apps.recordings.frames import SAME_M, SAME_RAD, counted, grouped, near
 from cell.apps.recordings.result import RecordedResult, closed_form_figures, hand_eye_figures, setup_note
+from cell.apps.recordings.series import Listing
+from cell.apps.recordings.texts import decoded, structured
 from cell.measure.calibration.judge.checks import QualityCheck
 from cell.measure.calibration.judge.scale import metric_scale
 from cell.measure.calibration.solve.starts import HandEye, refine_hand_eye, solve_hand_eye
@@ -28,30 +30,51 @@ SAME_BOARD_SHARE = 1e-3
 """Poses of boards in m within this share of their distance are of one place."""
 
 
-def read_pose_pairs(folder: Path) -> list[Pair]:
-    """Pairs from the folder's JSON files; empty when none holds such a list.
+def read_pose_pairs(listing: Listing) -> list[Pair]:
+    """Pairs from the JSON file of a folder that holds such a list; empty when none does.
 
-    Raises ConfigError for a list of pairs with a matrix that is no pose.
+    Raises ConfigError for a list of pairs with a matrix that is no pose, for two such lists, and for a file that cannot
+    be read where there is nothing else.
     """
-    for path in sorted(folder.glob("*.json")):
-        try:
-            pairs: Array = np.asarray(json.loads(path.read_text(encoding="utf-8")), dtype=np.float64)
-        except (ArithmeticError, ValueError, TypeError, OSError, RecursionError):
+    found: dict[Path, Array] = {}
+    for path in listing.texts:
+        if path.suffix.lower() != ".json":
             continue
-        if pairs.ndim != 4 or pairs.shape[1:] != (2, 4, 4):
-            continue
-        for k in np.flatnonzero(~np.isfinite(pairs).all(axis=(1, 2, 3))):
-            text = f"pair {k} holds a value that is no finite number; correct or remove the pair"
-            raise ConfigError(f"{path}: {text}")
         try:
-            return [(from_matrix(a), from_matrix(b)) for a, b in pairs]
+            data = structured(".json", decoded(path.read_bytes()))
+        except (ValueError, OSError, RecursionError) as error:
+            if not listing.pictures:
+                raise ConfigError(f"{path}: {error}; give it whole, or take it out of the folder") from error
+            continue
+        try:
+            pairs = np.asarray(data, dtype=np.float64)
+        except (ArithmeticError, ValueError, TypeError):
+            continue
+        if pairs.ndim == 4 and pairs.shape[1:] == (2, 4, 4):
+            found[path] = pairs
+    if len(found) > 1:
+        names = ", ".join(map(listing.name, found))
+        raise ConfigError(f"{listing.folder}: pairs of poses are in {names}; put them into one list, or give one file")
+    return [pair for path, pairs in found.items() for pair in _poses(path, pairs)]
+
+
+def _poses(path: Path, pairs: Array) -> list[Pair]:
+    made = []
+    for k, (flange, board) in enumerate(pairs):
+        if not np.isfinite(pairs[k]).all():
+            raise ConfigError(f"{path}: pair {k} holds a value that is no finite number; correct or remove the pair")
+        try:
+            made.append((from_matrix(flange), from_matrix(board)))
         except ValueError as error:
-            raise ConfigError(f"{path}: {error}") from error
-    return []
+            raise ConfigError(
+                f"{path}: pair {k}: {error}. Numbers that stand by columns are to be transposed; a left-handed frame "
+                "is to be turned into a right-handed one"
+            ) from error
+    return made
 
 
-def calibrate_pairs(pairs: Sequence[Pair]) -> RecordedResult:
-    """Hand-eye from pairs, camera on the flange or standing before the board.
+def calibrate_pairs(pairs: Sequence[Pair], wanted: str | None = None) -> RecordedResult:
+    """Hand-eye from pairs, camera on the flange or standing before the board: as is `wanted`, or as the poses tell.
 
     Pairs that do not agree with most are left out and named. Raises ConfigError when they give none.
     """
@@ -75,7 +98,7 @@ def calibrate_pairs(pairs: Sequence[Pair]) -> RecordedResult:
             f"{LEAST_PAIRS}"
         )
     boards = [board for _, board in kept]
-    setup, closed, flanges = _closed_form(kept)
+    setup, closed, flanges = _closed_form(kept, wanted)
     refined, sigma, off = refine_hand_eye(flanges, boards, closed)
     left_out, found = float(np.sqrt(np.mean(off**2))), refined.flange_from_camera
     method, scatter = "Park-Martin, then robust least squares on the poses", (refined.scatter_m, refined.scatter_rad)
@@ -87,15 +110,27 @@ def calibrate_pairs(pairs: Sequence[Pair]) -> RecordedResult:
     result.notes.append("pairs of poses only: no intrinsics, no light plane, no flatness")
     reach = float(np.median([np.linalg.norm(b.translation) for b in boards]))
     checks = _checks(difference(found, closed.flange_from_camera), sigma, left_out, reach=reach, count=len(kept))
+    if along_axes(found.rotation) and (far := float(np.linalg.norm(found.translation))) < OWN_SHARE * reach:
+        checks.append(_in_the_origin(setup, far))
     scale = metric_scale(flanges, boards)
     result.apply(checks + ([] if scale is None else [scale.check(checks)]))
     return result
 
 
-def _closed_form(pairs: Sequence[Pair]) -> tuple[str, HandEye, list[pin.SE3]]:
+def _in_the_origin(setup: str, far: float) -> QualityCheck:
+    """Of a camera `far`, m, from flange or base and along its axes: hardly a camera."""
+    origin = "flange" if setup == "eye_in_hand" else "base"
+    return QualityCheck(
+        "hand_eye", "a camera at the origin", 1.0, doubt=0.5, refuse=math.inf, unit="",
+        says=f"the camera would be {1e3 * far:.1f} mm from the {origin}'s origin and along its axes: is the second of "
+        "each pair the camera as the board sees it? Invert it",
+    )  # fmt: skip
+
+
+def _closed_form(pairs: Sequence[Pair], wanted: str | None) -> tuple[str, HandEye, list[pin.SE3]]:
     """Set-up, hand-eye and flange poses, the camera on the flange or before it, whichever scatters the board less."""
     solutions: list[tuple[str, HandEye, list[pin.SE3]]] = []
-    for setup in ("eye_in_hand", "eye_to_hand"):
+    for setup in ("eye_in_hand", "eye_to_hand") if wanted is None else (wanted,):
         flanges = [f if setup == "eye_in_hand" else f.inverse() for f, _ in pairs]
         try:
             solutions.append((setup, solve_hand_eye(flanges, [board for _, board in pairs]), flanges))

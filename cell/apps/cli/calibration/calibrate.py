@@ -202,6 +202,8 @@ def verdicts(result: Result) -> list[str]:
         texts = [
             c["text"].split(": ", 1)[-1] for c in result["checks"] if c["part"] == part and c["verdict"] == "doubt"
         ]
+        if part == "hand_eye":
+            texts = [n.removeprefix("doubt: ") for n in result["notes"] if n.startswith("doubt: ")] + texts
         ran = sum(c["part"] == part for c in result["checks"])
         if refused:
             lines.append(f"{name}: REFUSED{f' (do not use: {value})' if value else ''}: {refused}")

@@ -257,8 +257,10 @@ def against_pictures(given: Intrinsics, views: Sequence[BoardView]) -> tuple[Int
     worst = int(np.argmax(np.abs(apart) / sigma))
     # A difference counts as an error of the given camera as far as the pictures know better than that is usual.
     usual = np.diag((USUAL_SHARE * focal) ** 2)
-    likely = np.concatenate([usual @ np.linalg.solve(usual + pictures.covariance[:4, :4], apart), np.zeros(5)])
-    covariance = given.covariance + np.outer(likely, likely)
+    believed = usual @ np.linalg.inv(usual + pictures.covariance[:4, :4])
+    likely, covariance = believed @ apart, given.covariance.copy()
+    # What the pictures do not tell stays open: where they agree with it by chance, it is known no better.
+    covariance[:4, :4] += np.outer(likely, likely) + usual - believed @ usual
     far = np.abs(apart) / focal > REFUSE_SHARE
     refuse = REFUSE_SIGMAS if np.any(far & (np.abs(apart) / sigma >= REFUSE_SIGMAS)) else np.inf
     check = QualityCheck(

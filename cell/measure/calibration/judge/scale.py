@@ -19,8 +19,6 @@ from cell.measure.calibration.solve.starts import park_martin
 from cell.measure.geometry.camera import Array
 from drivers.errors import Measured, RefusedError
 
-UNITS = {1000.0: "mm", 100.0: "cm", 1 / 0.0254: "inches"}
-UNIT_SHARE = 0.2
 LEAST_FRAMES = 5
 DOUBT, REFUSE = 1.0, 5.0
 DOUBT_SIGMAS, REFUSE_SIGMAS, UNSURE_SIGMAS = 3.0, 5.0, 2.0
@@ -67,26 +65,15 @@ class Scale:
         beyond = min(1.0, off / max(UNSURE_SIGMAS * self.sigma, 1e-12))
         return 1.0 if self.believed else math.hypot(beyond, min(self.sigma, NAMED_SHARE) / max(off, 1e-12))
 
-    @property
-    def unit(self) -> str | None:
-        """The unit in which the arm's positions seem to be; None when it is the metre or none that is known."""
-        return next((name for factor, name in UNITS.items() if abs(self.value / factor - 1) < UNIT_SHARE), None)
-
     def check(self, others: Iterable[QualityCheck]) -> QualityCheck:
         """How far it is from 1; a doubt where it stands alone against the `others` of the hand-eye."""
         alone = self.explained < CLEARLY and all(c.verdict == "ok" for c in others if c.name in INDEPENDENT)
-        share = 100 * self.sigma / max(abs(self.value), 1e-9)
-        off = 100 * abs(math.log(max(self.value, 1e-9)))
-        if self.unit is not None:
-            says = f"by the pictures the flange's positions are in {self.unit}, not in m"
-        else:
-            says = (
-                f"by the arm's travel the board is {self.value:.4f} ± {self.sigma:.4f} times as large as its name "
-                "says: measure its pitch; if that is right, the poses are in another unit or of another arm"
-            )
+        share, off = 100 * self.sigma / self.value, 100 * abs(math.log(self.value))
         return QualityCheck(
             "hand_eye", "arm's travel against the board's size", off, doubt=max(DOUBT, DOUBT_SIGMAS * share),
-            refuse=math.inf if alone and self.unit is None else max(REFUSE, REFUSE_SIGMAS * share), unit="%", says=says,
+            refuse=math.inf if alone else max(REFUSE, REFUSE_SIGMAS * share), unit="%",
+            says=f"by the arm's travel the board is {self.value:.4f} ± {self.sigma:.4f} times as large as its name "
+            "says: measure its pitch; if that is right, the poses are in another unit or of another arm",
         )  # fmt: skip
 
 
@@ -111,6 +98,8 @@ def metric_scale(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> Scale
         solutions.append(np.linalg.lstsq(rows[kept].reshape(-1, 7), -travel[kept].ravel(), rcond=None)[0])
     values, count = np.array(solutions)[:, 6], len(flanges)
     sigma = np.sqrt((count - 1) / count * np.sum((values[1:] - values[1:].mean()) ** 2))
+    if not values[0] > UNSURE_SIGMAS * sigma:
+        return None
     known = rows.reshape(-1, 7)
     held = np.linalg.lstsq(known[:, :6], -travel.ravel() - known[:, 6], rcond=None)[0]
     free_off = known @ solutions[0] + travel.ravel()

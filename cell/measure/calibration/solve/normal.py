@@ -17,6 +17,7 @@ from cell.measure.geometry.board_projection import dots_terms
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import cross, from_parts, perturbed
+from drivers.errors import RefusedError
 
 CAMERA, PLANE, RAIL = slice(0, 9), slice(9, 12), slice(12, 15)
 HAND, BOARD = slice(15, 21), slice(21, 27)
@@ -257,6 +258,11 @@ class Normal:
         own_inverse = np.linalg.inv(own)
         gain = cross @ own_inverse
         reduced = shared - np.einsum("kij,klj->il", gain, cross)
+        if not (np.diag(reduced) > 0).all():
+            raise RefusedError(
+                "the views leave a part of what is looked for open, or contradict each other: see that all poses are "
+                "of one set-up and in one unit, and take more of them, turned to several sides"
+            )
         scale = 1 / np.sqrt(np.diag(reduced))
         covariance = np.linalg.inv(reduced * scale[:, None] * scale) * scale[:, None] * scale
         result = Inverse(

@@ -33,6 +33,17 @@ def test_the_plain_model_is_read(tmp_path, model, lens):
     assert camera.dist == (-0.1, 0.05, 0.001, -0.001, 0.2)
 
 
+@pytest.mark.parametrize("name", ["distortion", "coeffs", "dist", "D", "dist_coeffs"])
+def test_a_lens_in_a_list_beside_focal_lengths_by_name_is_read(tmp_path, name):
+    path = tmp_path / "camera.json"
+    camera = {"width": 1280, "height": 960, "fx": 1400.0, "fy": 1410.0, "cx": 650.0, "cy": 470.0}
+    write_json(path, {**camera, name: [-0.1, 0.05, 0.001, -0.001, 0.2]})
+    assert read_camera(path).dist == (-0.1, 0.05, 0.001, -0.001, 0.2)
+    write_json(path, {**camera, name: [0.0, 0.0, 0.0, 0.0, 0.0, 0.5]})
+    with pytest.raises(ConfigError, match=rf"{name}\[5\] is 0.5"):
+        read_camera(path)
+
+
 @pytest.mark.parametrize(
     ("model", "lens", "words"),
     [
@@ -134,7 +145,8 @@ def test_what_a_given_camera_is_off_by_is_stated_or_refused(off):
     assert right(result)
     if off == 1.0:
         assert not result["refused"]
-        assert np.linalg.norm(result["hand_eye"]["sigma_mm"]) < 1.0
+        # By the pictures alone it is 1.5 mm; that they agree with the file makes it known no better than both allow.
+        assert 1.1 < np.linalg.norm(result["hand_eye"]["sigma_mm"]) < 1.4
 
 
 def test_a_given_camera_that_nothing_checks_is_doubted_and_has_a_deviation():

@@ -8,8 +8,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from cell.apps.cli.calibration.calibrate import verdicts
+from cell.apps.recordings.command import Options, calibrate_folder
 from cell.apps.recordings.frames import RecordedFrame
 from cell.apps.recordings.pairs import calibrate_pairs, read_pose_pairs
+from cell.apps.recordings.series import list_folder
 from drivers.errors import ConfigError
 from tests.support.recorded_scenes import BOARD, DOTS_PX, FLANGE_FROM_CAMERA, given_pairs, right, scene, solved
 
@@ -90,9 +93,52 @@ def test_pairs_that_are_not_in_metres_are_refused(flange, board, words):
         calibrate_pairs(pairs)
 
 
-def test_a_pair_without_finite_numbers_is_named(tmp_path):
-    pairs = np.array([(f.homogeneous, b.homogeneous) for f, b in given_pairs(scene(laser=False))])
+def matrices() -> np.ndarray:
+    return np.array([(f.homogeneous, b.homogeneous) for f, b in given_pairs(scene(laser=False))])
+
+
+def stored(folder: Path, pairs: np.ndarray, name: str = "pairs.json", encoding: str = "utf-8") -> None:
+    (folder / name).write_bytes(json.dumps(pairs.tolist()).encode(encoding))
+
+
+@pytest.mark.parametrize(("name", "encoding"), [("p.JSON", "utf-8"), ("p.json", "utf-8-sig"), ("p.json", "utf-16")])
+def test_a_list_of_pairs_is_read_as_other_programs_write_it(tmp_path, name, encoding):
+    stored(tmp_path, matrices(), name, encoding)
+    assert len(read_pose_pairs(list_folder(tmp_path))) == len(matrices())
+
+
+def test_what_is_no_list_of_pairs_is_told_with_file_pair_and_next_step(tmp_path):
+    pairs = matrices()
     pairs[3, 1, 0, 3] = np.nan
-    (tmp_path / "pairs.json").write_text(json.dumps(pairs.tolist()))
-    with pytest.raises(ConfigError, match="pair 3"):
-        read_pose_pairs(tmp_path)
+    stored(tmp_path, pairs)
+    with pytest.raises(ConfigError, match="pair 3 holds"):
+        read_pose_pairs(list_folder(tmp_path))
+    stored(tmp_path, np.swapaxes(matrices(), 2, 3))
+    with pytest.raises(ConfigError, match=r"pairs\.json: pair 0: .* are to be transposed"):
+        read_pose_pairs(list_folder(tmp_path))
+    (tmp_path / "pairs.json").write_text(json.dumps(matrices().tolist())[:-100])
+    with pytest.raises(ConfigError, match=r"pairs\.json: it is no JSON: .*; give it whole"):
+        read_pose_pairs(list_folder(tmp_path))
+    for name in ("pairs.json", "more.json"):
+        stored(tmp_path, matrices(), name)
+    with pytest.raises(ConfigError, match=r"pairs of poses are in more\.json, pairs\.json"):
+        read_pose_pairs(list_folder(tmp_path))
+
+
+def test_the_set_up_that_a_person_named_is_the_one_and_what_pairs_have_nothing_of_is_refused(tmp_path):
+    stored(tmp_path, matrices())
+    for setup, told in ((None, "eye_in_hand"), ("eye_in_hand", "eye_in_hand"), ("eye_to_hand", "eye_to_hand")):
+        result = calibrate_folder(tmp_path, None, Options(setup=setup)).as_dict()
+        assert (result["hand_eye"] or result["refused_values"]["hand_eye"])["setup"] == told
+    for said in ({"poses": "xyz+rpy-deg"}, {"laser": None}, {"pose_field": "tool"}):
+        with pytest.raises(ConfigError, match="holds pairs of poses in m, no pictures; leave it out"):
+            calibrate_folder(tmp_path, None, Options(**said))
+
+
+def test_a_camera_in_the_flange_is_a_doubt():
+    """The second of each pair upside down gives what the flange is to the board: here they are one."""
+    flanges = [flange for flange, _ in given_pairs(scene(laser=False))]
+    stands = pin.SE3(pin.exp3(np.array([0.3, -0.2, 0.4])), np.array([0.6, 0.1, 0.2]))
+    result = calibrate_pairs([(flange, flange.inverse() * stands) for flange in flanges]).as_dict()
+    assert [c["verdict"] for c in result["checks"] if c["name"] == "a camera at the origin"] == ["doubt"]
+    assert "Invert it" in verdicts(result)[1]
