@@ -128,11 +128,7 @@ def decide(
         first = series[0].records[0]
         reason = (problems or [why_not(first.numbers, first.named, wanted)])[0]
         raise RefusedError(f"the poses of {series[0].name} cannot be read: {reason}; {NAME_IT}")
-    best = fits[0]
-    if best.series.by == "order":
-        # What names say holds where it agrees, too: by their order one pose more or less shifts all that follow.
-        named = (f for f in fits if f.series.name == best.series.name and f.series.by != "order")
-        best = next((f for f in named if f.score < AGREES and not _clearly_worse(f, best)), best)
+    best = _best(fits)
     if not best.score < AGREES:
         raise RefusedError(_none_agrees(fits, pitch))
     rival = next((f for f in fits if f is not best and not _same(f, best, boards)), None)
@@ -142,6 +138,13 @@ def decide(
         if not _clearly_worse(rival, best):
             raise RefusedError(_question(best, rival))
     return Decision(best, rival, sorted(own))
+
+
+def _best(fits: Sequence[Fit]) -> Fit:
+    """The first of the fits. What names say holds where it agrees, too: an order is shifted by one pose that lacks."""
+    first = fits[0]
+    named = [f for f in fits if f.series.name == first.series.name and f.series.by != first.series.by == "order"]
+    return next((f for f in named if f.score < AGREES and not _clearly_worse(f, first)), first)
 
 
 def _clearly_worse(rival: Fit, best: Fit) -> bool:

@@ -90,7 +90,7 @@ def _camera(data: Mapping[str, Any]) -> CameraModel:
     return camera
 
 
-def _of_matrix(data: Mapping[str, Any]) -> list[float]:
+def _of_matrix(data: Mapping[str, object]) -> list[float]:
     """fx, fy, cx and cy of a camera matrix."""
     of = _key(data, MATRICES)
     matrix = _numbers(data[of]).reshape(3, 3)

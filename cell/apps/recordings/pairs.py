@@ -110,21 +110,20 @@ def calibrate_pairs(pairs: Sequence[Pair], wanted: str | None = None) -> Recorde
     result.notes.append("pairs of poses only: no intrinsics, no light plane, no flatness")
     reach = float(np.median([np.linalg.norm(b.translation) for b in boards]))
     checks = _checks(difference(found, closed.flange_from_camera), sigma, left_out, reach=reach, count=len(kept))
-    if along_axes(found.rotation) and (far := float(np.linalg.norm(found.translation))) < OWN_SHARE * reach:
-        checks.append(_in_the_origin(setup, far))
+    checks += _in_the_origin(setup, found, reach)
     scale = metric_scale(flanges, boards)
     result.apply(checks + ([] if scale is None else [scale.check(checks)]))
     return result
 
 
-def _in_the_origin(setup: str, far: float) -> QualityCheck:
-    """Of a camera `far`, m, from flange or base and along its axes: hardly a camera."""
-    origin = "flange" if setup == "eye_in_hand" else "base"
-    return QualityCheck(
-        "hand_eye", "a camera at the origin", 1.0, doubt=0.5, refuse=math.inf, unit="",
-        says=f"the camera would be {1e3 * far:.1f} mm from the {origin}'s origin and along its axes: is the second of "
-        "each pair the camera as the board sees it? Invert it",
-    )  # fmt: skip
+def _in_the_origin(setup: str, found: pin.SE3, reach: float) -> list[QualityCheck]:
+    """A doubt where the hand-eye is next to none, as of poses that are inverted."""
+    far, origin = float(np.linalg.norm(found.translation)), "flange" if setup == "eye_in_hand" else "base"
+    if far > OWN_SHARE * reach or not along_axes(found.rotation):
+        return []
+    says = f"the camera would be {1e3 * far:.1f} mm from the {origin}'s origin and along its axes: is the second of "
+    says += "each pair the camera as the board sees it? Invert it"
+    return [QualityCheck("hand_eye", "a camera at the origin", 1.0, doubt=0.5, refuse=math.inf, unit="", says=says)]
 
 
 def _closed_form(pairs: Sequence[Pair], wanted: str | None) -> tuple[str, HandEye, list[pin.SE3]]:
