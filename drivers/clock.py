@@ -50,10 +50,8 @@ class Clock:
 
     @contextmanager
     def alarm(self, seconds: float, ring: Callable[[], float | None]) -> Iterator[None]:
-        """Inside this context call `ring()` after `seconds`, whatever this thread does meanwhile.
-
-        `ring` gives in how many seconds to call it again, or None; it is called by another thread.
-        """
+        """Inside this context call `ring()` after `seconds`, whatever this thread does meanwhile. `ring` gives in how
+        many seconds to call it again, or None; it is called by another thread."""
         over = threading.Event()
 
         def watch() -> None:

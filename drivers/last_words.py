@@ -140,9 +140,7 @@ _NICENESS = -10
 
 class Pulse:
     """Calls `beat` every `BEAT_S` on a thread of its own until `close`, or until `beat` fails because nobody listens.
-
-    The thread runs before others where the system allows it.
-    """
+    The thread runs before others where the system allows it."""
 
     def __init__(self, name: str, beat: Callable[[], None]) -> None:
         self._beat = beat

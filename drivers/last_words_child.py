@@ -22,10 +22,8 @@ ALONE_S = 0.3
 
 
 class Owner:
-    """Signs of life of the process `pid`: its beats, the processor time that it uses, and that it waits for some.
-
-    The time counts as well, because a process that computes may hold Python's lock and send no beat meanwhile.
-    """
+    """Signs of life of the process `pid`: its beats, the processor time that it uses, and that it waits for some. The
+    time counts as well, because a process that computes may hold Python's lock and send no beat meanwhile."""
 
     def __init__(self, pid: int) -> None:
         self._stat, self._threads = f"/proc/{pid}/stat", f"/proc/{pid}/task"
@@ -66,10 +64,8 @@ class Owner:
 
 
 def raise_priority() -> None:
-    """Run before the processes that compute, where the system allows it: in real time, else with a lower niceness.
-
-    A thread that spins in real time would leave nothing to all others: after `ALONE_S` this process loses the right.
-    """
+    """Run before the processes that compute, where the system allows it: in real time, else with a lower niceness. A
+    thread that spins in real time would leave nothing to all others: after `ALONE_S` this process loses the right."""
     try:
         import resource  # not on Windows, where this file is imported as well
 

@@ -48,10 +48,8 @@ class SocketPort(protocol_socket.Serial):
 def open_port(
     name: str, url: str, *, baud: int, timeout: float, parity: str = "none", stop_bits: int = 1
 ) -> serial.Serial:
-    """A device file or pyserial URL, opened; `timeout` in wall seconds is that of a read.
-
-    No other program that asks for a lock has the port meanwhile. Raises `NotConnectedError` for the device `name`.
-    """
+    """A device file or pyserial URL, opened; `timeout` in wall seconds is that of a read. No other program that asks
+    for a lock has the port meanwhile. Raises `NotConnectedError` for the device `name`."""
     try:
         make = cast("type[serial.Serial]", SocketPort) if url.startswith("socket://") else serial.serial_for_url
         port = make(
@@ -68,10 +66,8 @@ def open_port(
 
 
 def forget_unasked(link: socket.socket) -> None:
-    """Throw away what came before a question: it answers nothing, and the answer would be taken for the next one's.
-
-    The link waits for nothing afterwards until it is given a timeout. Raises OSError when the other side closed it.
-    """
+    """Throw away what came before a question: it answers nothing, and the answer would be taken for the next one's. The
+    link waits for nothing afterwards until it is given a timeout. Raises OSError when the other side closed it."""
     link.setblocking(False)
     try:
         # As much as a device that babbles can have sent; more is told by the answers.

@@ -76,11 +76,8 @@ class ArmSwitchedLaser(_Switch):
 
     @contextmanager
     def lit(self) -> Iterator[None]:
-        """On inside the context, off after it, whatever happens inside.
-
-        Raises `InterlockError`, with nothing switched, when the laser is lit already: by another context of this
-        program or by anything else that set the output.
-        """
+        """On inside the context, off after it, whatever happens inside. Raises `InterlockError`, with nothing switched,
+        when the laser is lit already: by another context of this program or by anything else that set the output."""
         if not self._owner.acquire(blocking=False):
             raise InterlockError(self.name, "is already lit by another owner. Wait until that one has finished")
         try:

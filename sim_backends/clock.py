@@ -90,10 +90,8 @@ class History:
                 self._samples.popleft()
 
     def at(self, t: float) -> Pose:
-        """The pose (4, 4) at world time `t`: translation linear, rotation at constant rate about one axis.
-
-        Raises LookupError while nothing has been remembered.
-        """
+        """The pose (4, 4) at world time `t`: translation linear, rotation at constant rate about one axis. Raises
+        LookupError while nothing has been remembered."""
         with self._lock:
             if not self._samples:
                 raise LookupError("the history is empty: append a pose before reading one")

@@ -82,10 +82,8 @@ class Attempts:
 
 
 def await_word(step: Step, end: Failure, watchman: Watchman) -> tuple[Failure | None, str | None]:
-    """Wait until a person has confirmed the fault `end`: why that ended the run, or None; and who it was.
-
-    A fault that no recovery can clear, such as an emergency stop, ends the wait and the run.
-    """
+    """Wait until a person has confirmed the fault `end`: why that ended the run, or None; and who it was. A fault that
+    no recovery can clear, such as an emergency stop, ends the wait and the run."""
     policy, control, notify = watchman.policy, watchman.control, watchman.events.notify
     if policy.simulated_person:
         by = "the simulated person"

@@ -45,10 +45,8 @@ class JournalError(RuntimeError):
 
 @dataclass(frozen=True)
 class RunRow:
-    """One run; `ended`, `outcome` and `reason` are None while it runs, and for ever if it was killed.
-
-    `pid` is the process that does it, None where an older journal does not tell.
-    """
+    """One run; `ended`, `outcome` and `reason` are None while it runs, and for ever if it was killed. `pid` is the
+    process that does it, None where an older journal does not tell."""
 
     id: str
     started: float
@@ -97,9 +95,7 @@ class Journal:
 
     def __init__(self, folder: Path, run: str, info: Mapping[str, object] | None = None) -> None:
         """Begin the run `run`; `info` is JSON-ready (seed, level, job, hashes …), its "pid" the process that does it.
-
-        `JournalError` if it cannot.
-        """
+        `JournalError` if it cannot."""
         self.run = run
         self.path = folder / FILE_NAME
         self._lock = threading.Lock()
@@ -154,10 +150,8 @@ class Journal:
         )  # fmt: skip
 
     def take_requests(self) -> list[RunRequest]:
-        """What other processes have asked for since the last call, oldest first; asked by one thread.
-
-        It only reads, over a connection of its own: a write that stalls keeps nobody from being heard.
-        """
+        """What other processes have asked for since the last call, oldest first; asked by one thread. It only reads,
+        over a connection of its own: a write that stalls keeps nobody from being heard."""
         try:
             rows = self._asked.execute(
                 "SELECT id, kind, reason, number FROM requests WHERE id > ? ORDER BY id", (self._taken,)
@@ -213,11 +207,8 @@ class JournalRecord:
 
 
 def read(folder: Path, *, whole: bool = False) -> JournalRecord:
-    """Read the journal in a run's folder, also while it is being written.
-
-    With `whole` the file's structure is checked as well, which takes longer. `JournalError` if there is none, or one
-    with a row that is not as it was written.
-    """
+    """Read the journal in a run's folder, also while it is being written. With `whole` the file's structure is checked
+    as well, which takes longer. `JournalError` if there is none, or one with a row that is not as it was written."""
 
     def rows(base: sqlite3.Connection) -> JournalRecord:
         if whole and (found := base.execute("PRAGMA quick_check(1)").fetchone()) != ("ok",):
@@ -294,10 +285,8 @@ def _table(text: object) -> dict[str, object]:
 
 
 def request(folder: Path, kind: str, reason: str, number: int | None = None) -> None:
-    """Ask the run in `folder` for `kind`, one of `REQUESTS`; the runner sees it within a fraction of a second.
-
-    A "confirm" has the `number` of the question that it answers: it counts for no other.
-    """
+    """Ask the run in `folder` for `kind`, one of `REQUESTS`; the runner sees it within a fraction of a second. A
+    "confirm" has the `number` of the question that it answers: it counts for no other."""
     if kind not in REQUESTS:
         raise ValueError(f"request '{kind}' is unknown; a run takes {', '.join(REQUESTS)}")
     if kind == "confirm" and number is None:

@@ -164,11 +164,8 @@ class Runner:
             raise ValueError(f"no work was given for {', '.join(missing)}")
 
     def run(self) -> RunResult:
-        """Do the steps and return how it ended.
-
-        Raises nothing: every exception of a step, of the journal or of the runner itself becomes an outcome, after
-        the safe stop.
-        """
+        """Do the steps and return how it ended. Raises nothing: every exception of a step, of the journal or of the
+        runner itself becomes an outcome, after the safe stop."""
         with self._watching():
             self.sequence.on_change = self._events.changed
             try:

@@ -119,10 +119,8 @@ class Summarised(Protocol):
 
 
 def summary_of(made: object) -> dict[str, object] | None:
-    """What a step's result says for the journal and the report, None when it has nothing to say.
-
-    One whose summary fails says why: the step is done all the same.
-    """
+    """What a step's result says for the journal and the report, None when it has nothing to say. One whose summary
+    fails says why: the step is done all the same."""
     if not isinstance(made, Summarised):
         return None
     try:
@@ -133,11 +131,8 @@ def summary_of(made: object) -> dict[str, object] | None:
 
 @dataclass(frozen=True)
 class Event:
-    """What an observer is told, with the time in seconds since the epoch.
-
-    `kind` is state, step_started, step_done, step_failed, progress, safe_stop, note, fault, confirm_needed, confirmed,
-    decided, paused, going_on or run_ended.
-    """
+    """What an observer is told, with the time in seconds since the epoch. `kind` is state, step_started, step_done,
+    step_failed, progress, safe_stop, note, fault, confirm_needed, confirmed, decided, paused, going_on or run_ended."""
 
     kind: str
     step: str | None
@@ -229,10 +224,8 @@ class StepContext:
 
 @dataclass(frozen=True)
 class StepRecord:
-    """How one step went; `state` is open, done or failed.
-
-    `duration_s` sums all attempts in seconds of the cell's clock, `wall_s` in seconds on the wall.
-    """
+    """How one step went; `state` is open, done or failed. `duration_s` sums all attempts in seconds of the cell's
+    clock, `wall_s` in seconds on the wall."""
 
     name: str
     state: str = "open"
@@ -243,11 +236,8 @@ class StepRecord:
 
 @dataclass(frozen=True)
 class FaultRecord:
-    """A fault or a failed attempt on the way, and what was done about it.
-
-    `at` is in seconds since the epoch; `code` is short and stable; `remedy` is tried again, recovered, confirmed by a
-    person, noted, or ended the run.
-    """
+    """A fault or a failed attempt on the way, and what was done about it. `at` is in seconds since the epoch; `code` is
+    short and stable; `remedy` is tried again, recovered, confirmed by a person, noted, or ended the run."""
 
     at: float
     step: str
@@ -260,9 +250,7 @@ class FaultRecord:
 @dataclass(frozen=True)
 class RunResult:
     """How a run ended. `signal` is the number of the signal that ended it; `error` the exception behind the end.
-
-    `faults` are all that was met on the way, in their order, also those that the run went on after.
-    """
+    `faults` are all that was met on the way, in their order, also those that the run went on after."""
 
     outcome: Outcome
     reason: str

@@ -32,10 +32,8 @@ class Waiting(Protocol):
     """How work is done under watch."""
 
     def do(self, name: str, work: Callable[[], object], cut: Cut, grace: float) -> Call:
-        """Do `work()` and ask `cut()` meanwhile; once that gives a reason the work has `grace` seconds to end.
-
-        What comes back is done unless it was still busy after that.
-        """
+        """Do `work()` and ask `cut()` meanwhile; once that gives a reason the work has `grace` seconds to end. What
+        comes back is done unless it was still busy after that."""
 
     def check(self) -> None:
         """Called by work that is held on the wall's time, to see what is asked for; raises when it is to end."""

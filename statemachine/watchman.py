@@ -103,10 +103,8 @@ class Watchman:
     def watch(
         self, what: str, work: Callable[[], object], deadline: float, token: CancelToken, ailing: bool = False
     ) -> tuple[Call, Failure | None]:
-        """Have `work` done; on a request, a signal or the deadline end it, stop the cell and say why.
-
-        With `ailing` the cell's health is looked at as well. Time for which the run is held does not count.
-        """
+        """Have `work` done; on a request, a signal or the deadline end it, stop the cell and say why. With `ailing` the
+        cell's health is looked at as well. Time for which the run is held does not count."""
         cause: Failure | None = None
         trouble: str | None = None
         held = self.control.held_s
@@ -178,10 +176,8 @@ class Watchman:
         return None
 
     def wait_briefly(self) -> Failure | None:
-        """Wait for one poll, or less if the run is to end; the end that somebody asked for, if any.
-
-        On the wall's time: it is for a person, and the cell stands.
-        """
+        """Wait for one poll, or less if the run is to end; the end that somebody asked for, if any. On the wall's time:
+        it is for a person, and the cell stands."""
         self.control.token.event.wait(POLL_S)
         return self.asked()
 

@@ -119,11 +119,8 @@ def place(file: Path) -> tuple[int, int]:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Begin with what lasts longest.
-
-    Devices keep deadlines on the wall, which more workers than cores cannot always: a failure there is looked at again
-    a little later, and listed. What is wrong fails each time.
-    """
+    """Begin with what lasts longest. Devices keep deadlines on the wall, which more workers than cores cannot always: a
+    failure there is looked at again a little later, and listed. What is wrong fails each time."""
     items.sort(key=lambda item: place(item.path))
     again = config.pluginmanager.hasplugin("rerunfailures")
     for item in items:
@@ -167,9 +164,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """A worker gives way to those whose times matter more; it may not take that back, so its groups come in that order.
-
-    By the place of the file and not by its marker: a file that only computes may stand among devices.
-    """
+    By the place of the file and not by its marker: a file that only computes may stand among devices."""
     if "PYTEST_XDIST_WORKER" not in os.environ:
         return
     group, _ = place(item.path)

@@ -221,10 +221,8 @@ OWN = ("cell", "drivers", "statemachine", "sim_backends")
 def shadow_check(
     installed: Callable[[], Mapping[str, list[str]]] = packages_distributions, root: Path = Path(__file__).parents[2]
 ) -> DoctorCheck:
-    """Whether another distribution or another folder has a package of the same name as one of ours.
-
-    `installed` gives the distributions by package; `root` is the folder that holds our packages.
-    """
+    """Whether another distribution or another folder has a package of the same name as one of ours. `installed` gives
+    the distributions by package; `root` is the folder that holds our packages."""
     by_name = installed()
     others = {name: sorted(set(by_name.get(name, ())) - {DISTRIBUTION}) for name in OWN}
     for name, distributions in others.items():

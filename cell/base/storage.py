@@ -42,9 +42,7 @@ class EditedError(ValueError):
 @contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
     """Write a file in the place of `path`: a reader finds the old one or the new one, after a power cut as well.
-
-    Whatever fails, `OSError` of a full disk for one, leaves the old file and no other.
-    """
+    Whatever fails, `OSError` of a full disk for one, leaves the old file and no other."""
     temporary = path.with_name(f"{path.name}.{os.getpid()}-{secrets.token_hex(3)}.tmp")
     try:
         with temporary.open("wb") as file:
@@ -86,10 +84,8 @@ def sync_files(folder: Path) -> None:
 
 
 def write_json(path: Path, data: object) -> None:
-    """Write strict JSON by `replacing`. A digest that `data` has is made anew, so that it fits.
-
-    Raises `CellError` for a number that is none, such as NaN, for which JSON has no word: nothing is written then.
-    """
+    """Write strict JSON by `replacing`. A digest that `data` has is made anew, so that it fits. Raises `CellError` for
+    a number that is none, such as NaN, for which JSON has no word: nothing is written then."""
     if isinstance(data, dict) and DIGEST in data:
         data = sealed(data, parts=PARTS in data)
     try:

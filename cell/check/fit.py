@@ -68,10 +68,8 @@ def require_fit(job: Job, config: CellConfig, mesh: Path, *, calibrates: bool = 
 
 
 def read_fitting(name: str | Path, config: CellConfig, *, calibrates: bool = False) -> tuple[Job, Path]:
-    """The job of this file or name, or its first item, and the file of its surface's mesh.
-
-    Raises `ConfigError` where it does not fit the cell, or one of its items does not.
-    """
+    """The job of this file or name, or its first item, and the file of its surface's mesh. Raises `ConfigError` where
+    it does not fit the cell, or one of its items does not."""
     read = [load_job(item) for item in item_names(name)]
     for job, mesh in read:
         require_fit(job, config, mesh, calibrates=calibrates)

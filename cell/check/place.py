@@ -190,10 +190,8 @@ SCANNED_ACROSS = 0.02
 
 
 def way_problems(job: Job, config: CellConfig) -> Iterator[str]:
-    """What is wrong with the vehicle's poses: not on one floor, in the wrong order, or through the table.
-
-    Of an arm on a fixed frame only the target counts.
-    """
+    """What is wrong with the vehicle's poses: not on one floor, in the wrong order, or through the table. Of an arm on
+    a fixed frame only the target counts."""
     plan = job.approach
     named = {"target": plan.target.se3()}
     if config.vehicle.DRIVES:

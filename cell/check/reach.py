@@ -43,10 +43,8 @@ Goal = tuple[str, pin.SE3, tuple[Pair, ...]]
 def reach_problems(
     job: Job, config: CellConfig, extent: tuple[Vector, Vector], *, calibrates: bool = False
 ) -> Iterator[str]:
-    """A line for each of the poses, as drawn, that the arm cannot take. `extent` is the box around the surface, m.
-
-    The calibration's views are taken with an empty claw, or with the job's part in it if this job `calibrates`.
-    """
+    """A line for each of the poses, as drawn, that the arm cannot take. `extent` is the box around the surface, m. The
+    calibration's views are taken with an empty claw, or with the job's part in it if this job `calibrates`."""
     kinematics = arm_kinematics(config.arm.model, None)
     arm = arm_bodies(config.arm.model)
     deck = [*vehicle_bodies(deck_plates(config)), *vehicle_obstacles(config.obstacle)]
@@ -139,10 +137,8 @@ def _goals(job: Job, config: CellConfig) -> Iterator[Goal]:
 
 
 def seen_faces(job: Job) -> NominalSurface | None:
-    """The faces of the part that are looked at once it was placed; None where nobody looks.
-
-    Raises `ConfigError` where it has none, or its mesh is none.
-    """
+    """The faces of the part that are looked at once it was placed; None where nobody looks. Raises `ConfigError` where
+    it has none, or its mesh is none."""
     if job.part is None or job.place.verify == "none":
         return None
     part = NominalSurface.load(Path(job.part.mesh), unit=job.part.mesh_unit)

@@ -28,10 +28,8 @@ def connect(
     only: Collection[str] = tuple(DEVICES),
     otherwise: Callable[[str, Clock], Device | None] = lambda name, clock: None,
 ) -> Devices:
-    """Connect these devices, behind a gate; when one fails, those connected are closed and the error goes on.
-
-    What `otherwise` gives for a device's name is taken instead, unless it is None.
-    """
+    """Connect these devices, behind a gate; when one fails, those connected are closed and the error goes on. What
+    `otherwise` gives for a device's name is taken instead, unless it is None."""
     clock = Clock(config.cell.time_scale)
     made: dict[str, Any] = {}
     needed = connected_for(config, only)
@@ -63,10 +61,8 @@ def connected_for(config: CellConfig, wanted: Collection[str]) -> list[str]:
 
 
 def connect_one(config: CellConfig, name: str, clock: Clock, *, arm: Arm | None = None, look: bool = False) -> Any:
-    """One device, not behind a gate; what hangs on the arm is given the `arm`.
-
-    With `look` it is only looked at: nothing on it is set, started or ended, and what runs on it runs on.
-    """
+    """One device, not behind a gate; what hangs on the arm is given the `arm`. With `look` it is only looked at:
+    nothing on it is set, started or ended, and what runs on it runs on."""
     around = Surroundings(clock, look, arm)
     if DEVICES[name] == "arm":
         # Its own process switches the laser off when this one dies.

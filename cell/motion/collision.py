@@ -141,9 +141,7 @@ def station_bodies(
     surface_extent: tuple[Sequence[float], Sequence[float]] = ((-0.035, -0.018, 0.0), (0.035, 0.018, 0.015)),
 ) -> list[Body]:
     """Table, nominal surface, board and its post, placed by the measured pose of the place frame in the arm base.
-
-    `surface_extent` are the lowest and the highest corner of the surface in its own frame, m.
-    """
+    `surface_extent` are the lowest and the highest corner of the surface in its own frame, m."""
 
     def placed(name: str, low: Sequence[float], high: Sequence[float]) -> Body:
         local = block(name, BASE, low, high)
@@ -172,10 +170,8 @@ class CollisionError(RefusedError):
 
 
 class CollisionModel:
-    """Bodies of the arm, of what it carries and of its surroundings. One instance per thread.
-
-    `margin` is the distance in m below which two bodies count as touching.
-    """
+    """Bodies of the arm, of what it carries and of its surroundings. One instance per thread. `margin` is the distance
+    in m below which two bodies count as touching."""
 
     def __init__(self, kinematics: ArmKinematics, bodies: Sequence[Body], margin: float = 0.005) -> None:
         if not 0.0 <= margin <= 0.1:
@@ -218,10 +214,8 @@ class CollisionModel:
         return np.array([frozenset(pair) in names for pair in self.pairs], dtype=np.bool_)
 
     def _swing(self) -> NDArray[np.float64]:
-        """(pairs, 6) by how many m a pair can come nearer, at most, when a joint between the two turns by 1 rad.
-
-        That is how far from the joint's axis the farther body can reach: its own corners, and the links in between.
-        """
+        """(pairs, 6) by how many m a pair can come nearer, at most, when a joint between the two turns by 1 rad. That
+        is how far from the joint's axis the farther body can reach: its own corners, and the links in between."""
         links = [float(np.linalg.norm(self._model.jointPlacements[k].translation)) for k in range(2, 7)]
         swing = np.zeros((len(self.pairs), 6))
         shapes = {body.name: body for body in self.bodies}

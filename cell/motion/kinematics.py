@@ -29,10 +29,8 @@ class Unreachable(RefusedError):
 
 @dataclass(frozen=True)
 class DenavitHartenberg:
-    """Table of an arm, by joint: d and a in m, alpha and theta in rad; theta is added to the joint's angle.
-
-    Default: UR10e (docs/reference/protocols.md, section 1).
-    """
+    """Table of an arm, by joint: d and a in m, alpha and theta in rad; theta is added to the joint's angle. Default:
+    UR10e (docs/reference/protocols.md, section 1)."""
 
     d: tuple[float, ...] = (0.1807, 0.0, 0.0, 0.17415, 0.11985, 0.11655)
     a: tuple[float, ...] = (0.0, -0.6127, -0.57155, 0.0, 0.0, 0.0)
@@ -259,11 +257,8 @@ _POSTURES: Joints = np.random.default_rng(1).uniform(-2.8, 2.8, (24, 6))
 
 @dataclass(frozen=True)
 class ArmDimensions:
-    """One model: lengths of the maker's table in m, and the thickness of its links in m.
-
-    `upper` and `forearm` are how far the two long links lie beside joint 2, along its axis, and their radius; `wrist`
-    and `base` are radii.
-    """
+    """One model: lengths of the maker's table in m, and the thickness of its links in m. `upper` and `forearm` are how
+    far the two long links lie beside joint 2, along its axis, and their radius; `wrist` and `base` are radii."""
 
     name: str
     d1: float
@@ -315,10 +310,8 @@ MODELS = {
 
 
 def arm_kinematics(model: str, told: LinkTable | None, limits: JointLimits | None = None) -> ArmKinematics:
-    """The kinematics of an arm of `model` whose controller told its own table, or none: then it is the maker's.
-
-    Raises `ConfigError` when what it told belongs to no arm of this model; the text names the model that is nearest.
-    """
+    """The kinematics of an arm of `model` whose controller told its own table, or none: then it is the maker's. Raises
+    `ConfigError` when what it told belongs to no arm of this model; the text names the model that is nearest."""
     nominal = MODELS[model].table
     if told is None:
         return ArmKinematics(nominal, limits)

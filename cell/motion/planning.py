@@ -43,10 +43,8 @@ def search(
     free: Callable[[Joints], bool], start: Joints, end: Joints,
     ranges: tuple[NDArray[np.float64], NDArray[np.float64]], effort: Effort,
 ) -> NDArray[np.float64] | None:  # fmt: skip
-    """Corners (n, 6) rad of a way from `start` to `end`, straight between them, or None when none was found.
-
-    `ranges` are the least and the greatest joint angles (6,); `free` says whether the arm may stand there.
-    """
+    """Corners (n, 6) rad of a way from `start` to `end`, straight between them, or None when none was found. `ranges`
+    are the least and the greatest joint angles (6,); `free` says whether the arm may stand there."""
     low = np.maximum(ranges[0], np.minimum(start, end) - effort.room)
     high = np.minimum(ranges[1], np.maximum(start, end) + effort.room)
     # Most moves are direct: whoever needs no search does not wait for the library.
@@ -149,10 +147,8 @@ EFFORTS = (
 
 
 class Planner:
-    """Plans motions of one arm among one set of bodies. One instance per thread.
-
-    `tool_speed` in m/s binds every point of the flange and of what it carries, in free moves and in lines.
-    """
+    """Plans motions of one arm among one set of bodies. One instance per thread. `tool_speed` in m/s binds every point
+    of the flange and of what it carries, in free moves and in lines."""
 
     def __init__(self, kinematics: ArmKinematics, collisions: CollisionModel, tool_speed: float | None = None) -> None:
         self.kinematics = kinematics
@@ -162,10 +158,8 @@ class Planner:
         self.limits = kinematics.limits
 
     def reach(self, base_from_flange: pin.SE3, seed: Joints, what: str, allowed: Sequence[Pair] = ()) -> Joints:
-        """Joint angles of a collision-free posture at the pose, the nearest to `seed`.
-
-        Raises `kinematics.Unreachable`, or `CollisionError` with the bodies that touch in the nearest posture.
-        """
+        """Joint angles of a collision-free posture at the pose, the nearest to `seed`. Raises `kinematics.Unreachable`,
+        or `CollisionError` with the bodies that touch in the nearest posture."""
         found = self.kinematics.solutions(base_from_flange, seed)
         if not found:
             self.kinematics.ik(base_from_flange, seed)

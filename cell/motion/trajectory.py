@@ -116,10 +116,8 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class LineLimits:
-    """Limits of a straight line: speed m/s, acceleration m/s², jerk m/s³ and turning speed rad/s.
-
-    The last `near` m of it, or its first when `leaving`, go at `near_speed` m/s at most.
-    """
+    """Limits of a straight line: speed m/s, acceleration m/s², jerk m/s³ and turning speed rad/s. The last `near` m of
+    it, or its first when `leaving`, go at `near_speed` m/s at most."""
 
     speed: float = 0.25
     acceleration: float = 0.8
@@ -235,10 +233,8 @@ def _refuse_singular(kinematics: ArmKinematics, trajectory: Trajectory) -> None:
 def _profile(
     speed: float, acceleration: float, jerk: float, period: float, near: tuple[float, float] = (0.0, 1.0)
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Ruckig's time-optimal way from 0 to 1, from rest to rest: times in s, about `period` apart, and positions.
-
-    `near` is how much of it, at its end, goes at what speed at most, in ways per second.
-    """
+    """Ruckig's time-optimal way from 0 to 1, from rest to rest: times in s, about `period` apart, and positions. `near`
+    is how much of it, at its end, goes at what speed at most, in ways per second."""
     for name, value in {"speed": speed, "acceleration": acceleration, "jerk": jerk, "period": period}.items():
         if not 0.0 < value < np.inf:
             raise ValueError(f"{name} {value} must be finite and greater than 0")
@@ -312,18 +308,14 @@ class FlangeTrack:
         return np.asarray((times >= self.times[0]) & (times <= self.times[-1]))
 
     def even(self, times: Vector) -> NDArray[np.bool_]:
-        """At which of the times (n,), which must be `inside`, the arm is known to have moved evenly.
-
-        An arm that paused where no state came from it was not on the straight way between the two states around.
-        """
+        """At which of the times (n,), which must be `inside`, the arm is known to have moved evenly. An arm that paused
+        where no state came from it was not on the straight way between the two states around."""
         after = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
         return np.asarray(self._bends[after - 1] <= MOST_BEND_M)
 
     def at(self, times: Vector) -> Vector:
-        """base_from_flange (n, 4, 4) at the times (n,), which must be `inside`.
-
-        Straight and at an even turn between two states. Raises `DeviceFault` when those are too far apart.
-        """
+        """base_from_flange (n, 4, 4) at the times (n,), which must be `inside`. Straight and at an even turn between
+        two states. Raises `DeviceFault` when those are too far apart."""
         after = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
         gaps = self.times[after] - self.times[after - 1]
         if len(gaps) and gaps.max() > self._longest_gap:

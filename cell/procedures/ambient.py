@@ -58,10 +58,8 @@ def shorten(camera: GatedCamera, exposure: float) -> None:
 
 
 def in_any_light(camera: GatedCamera, take: Callable[[], Taken]) -> Taken:
-    """What `take` photographs; again with shorter exposures where it refuses a picture that is partly white.
-
-    Raises what `take` raises, and `RefusedError` where the camera cannot expose so briefly.
-    """
+    """What `take` photographs; again with shorter exposures where it refuses a picture that is partly white. Raises
+    what `take` raises, and `RefusedError` where the camera cannot expose so briefly."""
     for _ in range(TRIES):
         try:
             return take()

@@ -96,10 +96,8 @@ class FrameStore:
             raise CellError(f"frames cannot be kept: {self._failure}; look at {self._folder}") from None
 
     def settle(self) -> dict[str, str]:
-        """Wait until all frames so far are on the disk: the SHA-256 of each file by its name.
-
-        Raises `CellError` when one could not be written.
-        """
+        """Wait until all frames so far are on the disk: the SHA-256 of each file by its name. Raises `CellError` when
+        one could not be written."""
         written = threading.Event()
         try:
             self._waiting.put(written, timeout=WRITE_TIMEOUT_S)

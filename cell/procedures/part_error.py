@@ -24,10 +24,8 @@ POSE_DRAWS = 20_000
 
 @lru_cache(maxsize=4)
 def part_points(nominal: NominalSurface) -> Vector:
-    """The 45 points (45, 3) in m on the mating face, part frame: 5 segments along x of 9 points each.
-
-    Not to be written to: a report asks for the same surface's points several times.
-    """
+    """The 45 points (45, 3) in m on the mating face, part frame: 5 segments along x of 9 points each. Not to be written
+    to: a report asks for the same surface's points several times."""
     low, high = nominal.vertices[:, :2].min(axis=0), nominal.vertices[:, :2].max(axis=0)
     count = SEGMENTS * POINTS_PER_SEGMENT
     along = low[0] + (high[0] - low[0]) * (np.arange(count) + 0.5) / count
@@ -62,20 +60,16 @@ def stated_bound(
 
 
 def point_covariances(job: Job, nominal: NominalSurface, pose: PlacePose, of_pose: Vector, placing: Vector) -> Vector:
-    """Covariances (45, 3, 3), m², base axes, of where the part's points end.
-
-    `of_pose` (6, 6) is that of the surface's pose, `placing` (6, 6) that of the flange as it lets go.
-    """
+    """Covariances (45, 3, 3), m², base axes, of where the part's points end. `of_pose` (6, 6) is that of the surface's
+    pose, `placing` (6, 6) that of the flange as it lets go."""
     points, place_flange = placed_points(job, nominal, pose)
     covariance = through(points - pose.base_from_surface.translation, of_pose)
     return covariance + through(points - place_flange.translation, placing)
 
 
 def part_covariance(job: Job, pose: PlacePose, placing: Vector) -> Vector:
-    """Covariance (6, 6), m² and rad², surface axes, of surface_from_part as it ends, about the part's origin.
-
-    Of the pose, of the flange as it lets go (`placing`, (6, 6), base axes) and of the grasp.
-    """
+    """Covariance (6, 6), m² and rad², surface axes, of surface_from_part as it ends, about the part's origin. Of the
+    pose, of the flange as it lets go (`placing`, (6, 6), base axes) and of the grasp."""
     base_from_part = pose.base_from_surface * job.place.surface_from_part.se3()
     place_flange = base_from_part * job.grasp.flange_from_part.se3().inverse()
     made = job.grasp.covariance

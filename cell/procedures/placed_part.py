@@ -83,10 +83,8 @@ class PlacedPart:
 
     @classmethod
     def of(cls, job: Job, seen: PartPose, points: Vector, stated: Vector) -> "PlacedPart":
-        """The part as `seen`, with what is not seen of it as it was `stated`, (6, 6), surface axes.
-
-        Raises `MisplacedError` where something is not seen, and the job does not content itself with the rest.
-        """
+        """The part as `seen`, with what is not seen of it as it was `stated`, (6, 6), surface axes. Raises
+        `MisplacedError` where something is not seen, and the job does not content itself with the rest."""
         unit = np.array([job.place.tolerance] * 3 + [job.place.tolerance_angle] * 3)
         values, ways = np.linalg.eigh(seen.covariance / np.outer(unit, unit))
         weak = ~(3.0 * np.sqrt(np.maximum(values, 0.0)) <= 1.0)
@@ -170,9 +168,7 @@ class PlacedPart:
     @cached_property
     def bound(self) -> dict[str, float]:
         """Below what, mm, 95 % of the points lie from where they belong, by axis of the surface's frame and for D.
-
-        Where they were seen counts, and what that may be off by, `SURE_PERCENT`.
-        """
+        Where they were seen counts, and what that may be off by, `SURE_PERCENT`."""
         errors = 1e3 * np.abs(self.offsets + self._errors)
         found = {name: errors[..., k] for k, name in enumerate("xyz")} | {"d": np.linalg.norm(errors, axis=-1)}
         return {

@@ -42,10 +42,8 @@ def nominal_of(job: Job, mesh: Path) -> NominalSurface:
 
 
 def ground_below(job: Job, extent: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
-    """The box around the surface that a sought part lies on, lowest and highest corner (3,), m, part frame.
-
-    `extent` is that of the surface in its own frame, of the job as it was read.
-    """
+    """The box around the surface that a sought part lies on, lowest and highest corner (3,), m, part frame. `extent` is
+    that of the surface in its own frame, of the job as it was read."""
     corners = np.array([[x, y, z] for x, y, z in product(*zip(*extent, strict=True))])
     found = transform(job.place.surface_from_part.se3().inverse(), corners)
     return found.min(axis=0), found.max(axis=0)

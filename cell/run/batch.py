@@ -52,9 +52,7 @@ class Distribution:
 @dataclass(frozen=True)
 class BatchOutcome:
     """What came of a batch of `count` parts: the `runs` of those that were tried, and why it ended; `file` keeps it.
-
-    `interrupted` says that a signal has ended it.
-    """
+    `interrupted` says that a signal has ended it."""
 
     job: str
     count: int

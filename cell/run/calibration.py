@@ -36,11 +36,8 @@ from statemachine.step import Event
 
 
 def serial_numbers(devices: Devices) -> dict[str, str]:
-    """Of the devices that a calibration belongs to, by name; asked from the devices themselves.
-
-    One that is simulated beside real ones says so: what was calibrated with it never passes for a real one's, nor the
-    other way round.
-    """
+    """Of the devices that a calibration belongs to, by name; asked from the devices themselves. One that is simulated
+    beside real ones says so: what was calibrated with it never passes for a real one's, nor the other way round."""
     owners: dict[str, Device] = {n: getattr(devices, n) for n in ("arm", "rail", "scan_camera", "target_camera")}
     simulated = () if devices.following is None else devices.following.simulated
     return marked({name: owner.identity().serial for name, owner in owners.items()}, simulated)
@@ -81,10 +78,8 @@ def observe_boards(
 
 
 def calibrate(cell: OpenCell, run: Run[object], job: str | Path) -> CellCalibration:
-    """Move through the calibration poses, solve, and store the result and what it came from, recorded in `run`.
-
-    `job` names the part that may be in the claw. Raises `CellError`, before anything moves, where it cannot be stored.
-    """
+    """Move through the calibration poses, solve, and store the result and what it came from, recorded in `run`. `job`
+    names the part that may be in the claw. Raises `CellError`, before anything moves, where it cannot be stored."""
     _require_writable(cell.calibrations_folder)
     ahead.begin()
     part_of, _ = load_job(job)
@@ -129,9 +124,7 @@ def _require_writable(folder: Path) -> None:
 @contextmanager
 def kept_if_refused(folder: Path, name: str) -> Iterator[None]:
     """What is refused of the camera's times in this block holds for the stored calibration as well, and is kept there.
-
-    Else jobs would go on with one that was made before the camera was set otherwise.
-    """
+    Else jobs would go on with one that was made before the camera was set otherwise."""
     try:
         yield
     except TimesRefused as refused:
@@ -157,10 +150,8 @@ def _ready(cell: OpenCell, context: WorkContext, calibration: CellCalibration, j
 
 
 def verify(cell: OpenCell, run: Run[object], calibration: CellCalibration, job: Job) -> Verification:
-    """Look at the deck boards again, recorded in `run`: how good `calibration` is, and what place error of `job`.
-
-    What it finds out about the laser is kept with the stored calibration.
-    """
+    """Look at the deck boards again, recorded in `run`: how good `calibration` is, and what place error of `job`. What
+    it finds out about the laser is kept with the stored calibration."""
     notify = partial(_notify, run, "verify")
 
     def work(context: WorkContext) -> Verification:

@@ -196,10 +196,8 @@ class Subscription:
 
 
 class Detached:
-    """An observer that is told in a thread of its own, so that it cannot slow the run.
-
-    One that fails is told nothing more; `failure` then says why.
-    """
+    """An observer that is told in a thread of its own, so that it cannot slow the run. One that fails is told nothing
+    more; `failure` then says why."""
 
     def __init__(self, observer: Callable[[Event], None]) -> None:
         self.failure: str | None = None

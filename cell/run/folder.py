@@ -164,10 +164,8 @@ def timeless(report: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_report(folder: Path) -> dict[str, Any]:
-    """The report of a run; for a run that has none yet, what the journal tells.
-
-    Raises `CellError` for a report or a journal that cannot be read, `ConfigError` where there is neither.
-    """
+    """The report of a run; for a run that has none yet, what the journal tells. Raises `CellError` for a report or a
+    journal that cannot be read, `ConfigError` where there is neither."""
     path = folder / REPORT
     if not path.exists():
         return _from_journal(folder)

@@ -53,9 +53,7 @@ class DriftSeries:
     @cached_property
     def _line(self) -> tuple[Array, Array] | None:
         """Where the line through the values is on the last day (k,), and its slope a day (k,); None without a trend.
-
-        There is one where chance would hardly bring it, and where no single step explains the values as well.
-        """
+        There is one where chance would hardly bring it, and where no single step explains the values as well."""
         ago, (jobs, axes) = self.days - self.days[-1], self.values.shape
         if jobs < FOR_A_TREND or np.ptp(ago) < OVER_DAYS:
             return None

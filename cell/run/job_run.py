@@ -54,9 +54,7 @@ from statemachine.step import Outcome
 @dataclass(frozen=True, eq=False)
 class ReadyJob:
     """A job with its kind, up to the step after which it is to end, its surface, and the script that looks at it.
-
-    `info` is for the journal: what a resumed run has to know.
-    """
+    `info` is for the journal: what a resumed run has to know."""
 
     job: Job
     kind: Kind
@@ -69,10 +67,8 @@ class ReadyJob:
     def read(
         cls, file: str | Path, config: CellConfig, until: str | None, script: Script, *, calibrates: bool = False
     ) -> Self:
-        """From its file or by its name; `ConfigError` when it does not fit the cell or has no such step.
-
-        With `calibrates` the cell may be calibrated first, with this job's part in the claw.
-        """
+        """From its file or by its name; `ConfigError` when it does not fit the cell or has no such step. With
+        `calibrates` the cell may be calibrated first, with this job's part in the claw."""
         job, mesh = load_job(file)
         require_fit(job, config, mesh, calibrates=calibrates)
         kind = kind_of(job).until(until)

@@ -81,10 +81,8 @@ def _amount(text: str, unit: str) -> float:
 
 
 def jog(cell: Cell, wish: Jog, job: str | Path = "pot", observer: Observer | None = None) -> dict[str, str]:
-    """Perform it and give where the device is afterwards, in words with units. Ctrl-C stops the cell.
-
-    The vehicle is also jogged with the arm in the looking pose of `job`.
-    """
+    """Perform it and give where the device is afterwards, in words with units. Ctrl-C stops the cell. The vehicle is
+    also jogged with the arm in the looking pose of `job`."""
     stops = cell.stops
     loaded, _ = load_job(job)
     begun: list[Begun] = []
@@ -120,10 +118,8 @@ def _jog_rail(cell: Cell, wish: Jog) -> dict[str, str]:
 
 
 def begin_program(arm: Arm) -> None:
-    """Begin the arm's control program anew where a stop, a silent computer or somebody at the pendant has ended it.
-
-    A lost link is connected again. Raises `DeviceFault` where that takes a person's word, as after a protective stop.
-    """
+    """Begin the arm's control program anew where a stop, a silent computer or somebody at the pendant has ended it. A
+    lost link is connected again. Raises `DeviceFault` where that takes a person's word, as after a protective stop."""
     if not arm_is_ready(arm):
         arm.recover()
 

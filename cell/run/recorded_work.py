@@ -41,10 +41,8 @@ BUSY = "this computer is too busy"
 
 
 def classify(error: BaseException, following: DeviceFollowing | None = None) -> Failure:
-    """What an exception means for the run; what failed besides, as it was ended, is told after it.
-
-    What a person is asked says what is simulated beside real devices (`following`).
-    """
+    """What an exception means for the run; what failed besides, as it was ended, is told after it. What a person is
+    asked says what is simulated beside real devices (`following`)."""
     failure = _classify(error)
     if notes := getattr(error, "__notes__", ()):
         failure = replace(failure, reason="; ".join([failure.reason, *notes]))
@@ -106,9 +104,7 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True, eq=False)
 class WorkContext:
     """What work is given to be held by: `check` raises once it is to end, `safe_point` also holds it when paused.
-
-    `keep(what, frame)` leaves a picture that the work looked at in the run's folder. `ask(what)` waits for a person.
-    """
+    `keep(what, frame)` leaves a picture that the work looked at in the run's folder. `ask(what)` waits for a person."""
 
     check: Callable[[], None]
     safe_point: Callable[[], None]
@@ -134,11 +130,8 @@ class RecordedWork:
     config: CellConfig | None = None
 
     def perform(self, work: Callable[[WorkContext], Made]) -> Made:
-        """Do `work` and record how it ended.
-
-        Raises `Aborted` when the run was ended (`Interrupted` by a signal), `DeviceFault` when the stop was not
-        confirmed, else what `work` raised; the cell is stopped first.
-        """
+        """Do `work` and record how it ended. Raises `Aborted` when the run was ended (`Interrupted` by a signal),
+        `DeviceFault` when the stop was not confirmed, else what `work` raised; the cell is stopped first."""
         started, begun = time.time(), self.devices.clock.now()
         with new_folder(self.root) as folder:
             facts = {"kind": self.kind, "pid": os.getpid(), **self.info}

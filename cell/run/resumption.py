@@ -37,10 +37,8 @@ class UnfinishedRun:
 
     @classmethod
     def find(cls, folder: Path, *, scripted: bool = False) -> Self:
-        """The run in `folder`; `ConfigError` when it came to an end of its own, or its job is another one by now.
-
-        A run that a script looked at is only found for one that is `scripted` as well.
-        """
+        """The run in `folder`; `ConfigError` when it came to an end of its own, or its job is another one by now. A run
+        that a script looked at is only found for one that is `scripted` as well."""
         try:
             record = read(folder, whole=True)
         except JournalError as error:

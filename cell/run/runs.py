@@ -80,10 +80,8 @@ class Run(Generic[Result]):
         self.control.abort(reason)
 
     def confirm(self, by: str = "the program that began the run", number: int | None = None) -> bool:
-        """Say that a person has looked and the run may go on; False when it waits for nobody's word.
-
-        With the `number` of a `ConfirmNeeded` the word counts for that question only.
-        """
+        """Say that a person has looked and the run may go on; False when it waits for nobody's word. With the `number`
+        of a `ConfirmNeeded` the word counts for that question only."""
         return self.control.confirm(by, number)
 
     def events(self) -> Subscription:

@@ -42,10 +42,8 @@ class FactoryKinematics:
 
 
 def read_factory_kinematics(address: str, timeout: float = 10.0) -> FactoryKinematics:
-    """Ask the controller at `address` within `timeout` wall seconds; it never raises for what the network does.
-
-    It tells as a connection begins, so a connection that brought nothing in half that time is followed by another.
-    """
+    """Ask the controller at `address` within `timeout` wall seconds; it never raises for what the network does. It
+    tells as a connection begins, so a connection that brought nothing in half that time is followed by another."""
     begun = time.monotonic()
     heard: list[str] = []
     for share in (0.5, 1.0):
@@ -96,9 +94,7 @@ def _parts(content: bytes) -> Iterator[tuple[int, bytes]]:
 
 def parse_kinematics_info(data: bytes) -> LinkTable:
     """The content of a kinematics info part, 220 bytes; later versions may append. ValueError when it tells no table.
-
-    Its checksums are of the joints' calibration and are not needed here.
-    """
+    Its checksums are of the joints' calibration and are not needed here."""
     if len(data) < _CONTENT.size:
         raise ValueError(f"kinematics of {len(data)} bytes, {_CONTENT.size} are needed")
     numbers = _CONTENT.unpack_from(data)
@@ -134,10 +130,8 @@ MOST_MASS, MOST_OFFSET = 1e-3, 1e-4
 
 
 def require_same_flange(device: str, forward: Forward, snapshot: Snapshot, unknown: str = "") -> None:
-    """Raise `DeviceFault` (arm.wrong_kinematics) when the two differ by more than `MOST_WAY` or `MOST_TURN`.
-
-    `unknown` says why the controller's own table is not known, if it is not.
-    """
+    """Raise `DeviceFault` (arm.wrong_kinematics) when the two differ by more than `MOST_WAY` or `MOST_TURN`. `unknown`
+    says why the controller's own table is not known, if it is not."""
     way, turn = _difference(forward, snapshot)
     if _near(way, turn):
         return
@@ -154,10 +148,8 @@ def require_same_flange(device: str, forward: Forward, snapshot: Snapshot, unkno
 
 
 def same_payload(snapshot: Snapshot, payload: tuple[float, Six]) -> bool:
-    """True when the controller reckons with `payload`, kg and centre of gravity (3,) in m.
-
-    A centre of zeros is none: the controller keeps the one that it had.
-    """
+    """True when the controller reckons with `payload`, kg and centre of gravity (3,) in m. A centre of zeros is none:
+    the controller keeps the one that it had."""
     (mass, centre), (set_mass, set_centre) = snapshot.payload, payload
     near = abs(mass - set_mass) <= MOST_MASS
     return near and (not any(set_centre) or math.dist(centre, set_centre) <= MOST_OFFSET)

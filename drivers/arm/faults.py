@@ -99,10 +99,8 @@ def require_remote(device: str, dashboard: Dashboard) -> None:
 
 
 def require_named(device: str, dashboard: Dashboard, model: str) -> None:
-    """Raise `DeviceFault` (arm.wrong_model) when the arm calls itself otherwise than `model`.
-
-    E-series controllers leave out the "e"; what names no model is left to the kinematics.
-    """
+    """Raise `DeviceFault` (arm.wrong_model) when the arm calls itself otherwise than `model`. E-series controllers
+    leave out the "e"; what names no model is left to the kinematics."""
     told = dashboard.ask("get robot model")
     plain = told.upper()
     if model and plain.startswith("UR") and plain not in (model.upper(), model.upper().removesuffix("E")):

@@ -116,10 +116,8 @@ class StreamTiming:
 
 @dataclass(frozen=True)
 class Ended:
-    """The motion is over: `how` is arrived, contact, stopped, or the code of a fault with its `text`.
-
-    `pace` is that of a trajectory's points.
-    """
+    """The motion is over: `how` is arrived, contact, stopped, or the code of a fault with its `text`. `pace` is that of
+    a trajectory's points."""
 
     motion: int
     how: str
@@ -208,9 +206,7 @@ class StateFeed:
 
     def fresh(self, max_age: float) -> tuple[Snapshot, float]:
         """The newest snapshot, at most `max_age` s old or received after the call, and its age in s of the clock.
-
-        Raises `DeadlineError` when there is none in time.
-        """
+        Raises `DeadlineError` when there is none in time."""
         self._alive()
         called = time.monotonic()
 

@@ -112,10 +112,8 @@ def readings(watched: Watched, *, judge_times: bool) -> list[Reading]:
 
 
 def drift(watched: Watched) -> float:
-    """By which part the arm's clock is faster than the host's: from the promptest states of the first and last third.
-
-    A state can only come late, so the promptest of many are the ones whose times compare.
-    """
+    """By which part the arm's clock is faster than the host's: from the promptest states of the first and last third. A
+    state can only come late, so the promptest of many are the ones whose times compare."""
     third = max(1, len(watched.arrived) // 3)
     late = watched.arrived - watched.measured
     first, last = int(np.argmin(late[:third])), len(late) - third + int(np.argmin(late[-third:]))

@@ -61,10 +61,8 @@ class ArmLimits:
         return mass, (x, y, z)
 
     def check_trajectory(self, device: str, times: Vector, joints: Vector) -> tuple[Vector, Vector]:
-        """Times (n,) s and joints (n, 6) rad if they are in order, inside the limits and nowhere too fast.
-
-        Raises `LimitError` that names the point.
-        """
+        """Times (n,) s and joints (n, 6) rad if they are in order, inside the limits and nowhere too fast. Raises
+        `LimitError` that names the point."""
         times, joints = np.asarray(times, dtype=float), np.asarray(joints, dtype=float)
         if times.ndim != 1 or len(times) < 2 or joints.shape != (len(times), 6):
             raise LimitError(

@@ -45,22 +45,16 @@ class _Pending:
 
 
 class ArmLink:
-    """A running child process, connected to the arm.
-
-    `on_snapshot` and `on_ended` are called from the link's own thread, and so is `on_lost`, once, when a link that was
-    up is lost otherwise than by `close`.
-    """
+    """A running child process, connected to the arm. `on_snapshot` and `on_ended` are called from the link's own
+    thread, and so is `on_lost`, once, when a link that was up is lost otherwise than by `close`."""
 
     def __init__(
         self, name: str, setup: ChildSetup, connect_deadline: float, on_snapshot: Callable[[Snapshot], None],
         on_ended: Callable[[Ended], None], on_lost: Callable[[DeviceFault], None],
         wanted: Callable[[], bool] = lambda: True,
     ) -> None:  # fmt: skip
-        """Start the child and wait until it is connected; `NotConnectedError` if it is not within the deadline,
-        or at once without ur-rtde.
-
-        `Aborted`, with the child gone, as soon as it is not `wanted` any more.
-        """
+        """Start the child and wait until it is connected; `NotConnectedError` if it is not within the deadline, or at
+        once without ur-rtde. `Aborted`, with the child gone, as soon as it is not `wanted` any more."""
         if missing := lacking("rtde_control", "ur-rtde"):
             raise NotConnectedError(name, missing)
         self.lost: DeviceFault | None = None
@@ -106,11 +100,8 @@ class ArmLink:
         return self._process.pid
 
     def call(self, name: str, *arguments: object, deadline: float) -> tuple[str, str] | None:
-        """Have the child do something; None, or the problem as (code, text).
-
-        Raises the link's `DeviceFault` when it is lost, or not answered within `deadline` wall seconds: then the child
-        hangs and is killed.
-        """
+        """Have the child do something; None, or the problem as (code, text). Raises the link's `DeviceFault` when it is
+        lost, or not answered within `deadline` wall seconds: then the child hangs and is killed."""
         pending = _Pending()
         number = next(self._numbers)
         with self._lock:
@@ -258,10 +249,8 @@ class ArmLink:
 
 
 def see_safe(address: str, outputs: tuple[int, ...], deadline: float) -> bool:
-    """Switch outputs of the arm off through a process of its own that needs nothing else.
-
-    True once the arm itself has shown that they are off and that it stands, False if it did not within `deadline` s.
-    """
+    """Switch outputs of the arm off through a process of its own that needs nothing else. True once the arm itself has
+    shown that they are off and that it stands, False if it did not within `deadline` s."""
     command = [sys.executable, "-m", "drivers.arm.child.main", "--safe", address, ",".join(map(str, outputs))]
     environment = dict(os.environ, PYTHONPATH=os.pathsep.join(path or "." for path in sys.path))
     try:
@@ -288,9 +277,7 @@ _HEADER = struct.Struct(">HB")
 
 class RtdeLink:
     """A connection to the arm at `address`; packets one at a time, all within `timeout` wall seconds of its opening.
-
-    Raises `TimeoutError` or another `OSError`.
-    """
+    Raises `TimeoutError` or another `OSError`."""
 
     def __init__(self, address: str, clock: Clock, timeout: float, traffic: Traffic | None = None) -> None:
         self._clock = clock
@@ -375,10 +362,8 @@ _UPDATE = "Update the controller's software."
 
 
 def probe(name: str, address: str, clock: Clock, timeout: float) -> None:
-    """Raise `NotConnectedError`, with what is wrong and what to do, unless the arm at `address` tells its states.
-
-    All within `timeout` wall seconds. Nothing on the arm is set, begun or ended.
-    """
+    """Raise `NotConnectedError`, with what is wrong and what to do, unless the arm at `address` tells its states. All
+    within `timeout` wall seconds. Nothing on the arm is set, begun or ended."""
 
     def refuse(what: str, remedy: str) -> NotConnectedError:
         return NotConnectedError(name, f"no connection to the arm at {address}: {what}. {remedy}")

@@ -14,10 +14,8 @@ _WALL_MARGIN_S = 0.5
 
 
 class UrMotion:
-    """A motion that was started; `contact` tells whether it ended at its force limit.
-
-    `pace` tells how regularly the points of a trajectory went out, once it has ended; None of other motions.
-    """
+    """A motion that was started; `contact` tells whether it ended at its force limit. `pace` tells how regularly the
+    points of a trajectory went out, once it has ended; None of other motions."""
 
     def __init__(self, device: str, what: str, number: int, clock: Clock, stop: Callable[[], None]) -> None:
         self.contact = False

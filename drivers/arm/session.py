@@ -88,19 +88,15 @@ _STARTING_S = 0.5
 
 
 class ArmSession:
-    """One arm as `setup` says, through one child process after the other; `link` is the present one.
-
-    `on_ended` is told how each motion ended, `on_broken` why none can go on. Times are wall seconds.
-    """
+    """One arm as `setup` says, through one child process after the other; `link` is the present one. `on_ended` is told
+    how each motion ended, `on_broken` why none can go on. Times are wall seconds."""
 
     def __init__(
         self, name: str, setup: ChildSetup, clock: Clock, connect_timeout: float, forward: Forward | None,
         unknown: str, on_ended: Callable[[Ended], None], on_broken: Callable[[Exception], None],
     ) -> None:  # fmt: skip
         """Connect. Raises `NotConnectedError`; `DeviceFault` in local control, and for another arm than it has to be.
-
-        `unknown` says why the controller's own table is not known, if it is not.
-        """
+        `unknown` says why the controller's own table is not known, if it is not."""
         self.setup = setup
         self.statistics = LinkStatistics()
         self.dashboard = Dashboard(name, setup.address, traffic=self.statistics.traffic)
@@ -303,9 +299,7 @@ class ArmSession:
 
     def _require_model(self) -> None:
         """As `require_same_arm`, but the first states may still be with another tool than the zero one just set.
-
-        Without the control program the tool may be any, so nothing is compared, but nothing moves then either.
-        """
+        Without the control program the tool may be any, so nothing is compared, but nothing moves then either."""
         forward = self._forward
         if forward is None or not self.setup.control or not self.feed.fresh(0.1)[0].program_running:
             return
@@ -315,9 +309,7 @@ class ArmSession:
 
     def _require_safe_without(self, error: DeviceFault, just: float = 0.0) -> None:
         """After a call that failed: return once the arm is safe by the other way, else say that it is not known to be.
-
-        A fault of anything but the link is raised as it is.
-        """
+        A fault of anything but the link is raised as it is."""
         if error.code not in ("arm.link_lost", "arm.link_closed", "arm.not_stopped"):
             raise error
         if problem := self._safing.confirm(just):

@@ -115,10 +115,8 @@ def read_times(folder: Path) -> list[Recorded]:
 
 
 class RecordedCamera:
-    """Plays the pictures of `folder`, each once; `shape` (height, width) is what they have to have.
-
-    Raises `ConfigError` for a recording that cannot be read, `NotConnectedError` when the folder is missing.
-    """
+    """Plays the pictures of `folder`, each once; `shape` (height, width) is what they have to have. Raises
+    `ConfigError` for a recording that cannot be read, `NotConnectedError` when the folder is missing."""
 
     def __init__(self, name: str, folder: Path, *, clock: Clock, shape: tuple[int, int]) -> None:
         self.name = name

@@ -34,10 +34,8 @@ class StampCheck:
         self._last: Frame | None = None
 
     def fault(self, frame: Frame) -> DeviceFault | None:
-        """The `DeviceFault` camera.exposure or camera.stamp that the frame shows, None for one that can be true.
-
-        Frames with a number below the last one's are late ones, of which nothing is said.
-        """
+        """The `DeviceFault` camera.exposure or camera.stamp that the frame shows, None for one that can be true. Frames
+        with a number below the last one's are late ones, of which nothing is said."""
         last = self._last
         if last is not None and frame.frame_id <= last.frame_id:
             return None

@@ -132,10 +132,8 @@ class StreamCamera:
 
     @contextmanager
     def stream(self) -> Iterator[FrameQueue]:
-        """Free-running acquisition for as long as the context is open; one at a time.
-
-        Frames that nobody takes are kept up to 64 MB; later ones are dropped and counted as lost.
-        """
+        """Free-running acquisition for as long as the context is open; one at a time. Frames that nobody takes are kept
+        up to 64 MB; later ones are dropped and counted as lost."""
         settings = {} if self._frame_rate is None else {"frame_rate_hz": self._frame_rate}
         with self._exclusive():
             self._compare_clocks()
@@ -343,10 +341,8 @@ class FrameLink:
             )
 
     def request(self, op: str, **fields: object) -> tuple[Header, float, float]:
-        """Ask the camera; returns the reply and the host times of sending and of its arrival.
-
-        Raises `DeviceFault` when the camera refuses (camera.refused) or is lost, `DeadlineError` when it is silent.
-        """
+        """Ask the camera; returns the reply and the host times of sending and of its arrival. Raises `DeviceFault` when
+        the camera refuses (camera.refused) or is lost, `DeadlineError` when it is silent."""
         with self._requesting:
             self.check()
             with self._answered:

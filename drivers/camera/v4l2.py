@@ -64,10 +64,8 @@ _OLDEST_S = 10.0
 
 
 class V4l2Camera:
-    """The camera at the device file `path`, set to (height, width) `shape` in the pixel format `fourcc`.
-
-    Raises `NotConnectedError` when there is none or another program has it, `ConfigError` when its size is another.
-    """
+    """The camera at the device file `path`, set to (height, width) `shape` in the pixel format `fourcc`. Raises
+    `NotConnectedError` when there is none or another program has it, `ConfigError` when its size is another."""
 
     def __init__(
         self, name: str, path: str, *, clock: Clock, shape: tuple[int, int], fourcc: str = "YUYV",

@@ -111,9 +111,7 @@ class RailLink(ABC):
     @contextmanager
     def _line(self, issued: int | None) -> Iterator[None]:
         """The line for this thread alone; `issued` is the count of stops when the caller decided to move, if it did.
-
-        Raises `Aborted` when a stop came since, `DeviceFault` (rail.link_lost) when the port fails.
-        """
+        Raises `Aborted` when a stop came since, `DeviceFault` (rail.link_lost) when the port fails."""
         with self._lock:
             if self._closed:
                 raise NotConnectedError(self.name, "the rail was closed. Open it again")
@@ -198,10 +196,8 @@ class RailAxis(ABC):
 
     @abstractmethod
     def _arrival(self, position: float, issued: int, samples: Samples, *, homed: bool = True) -> Callable[[], bool]:
-        """What is asked again and again whether it has arrived; appends its readings to `samples`.
-
-        Where it was not begun `homed`, the zero is neither asked for nor given up.
-        """
+        """What is asked again and again whether it has arrived; appends its readings to `samples`. Where it was not
+        begun `homed`, the zero is neither asked for nor given up."""
 
     @abstractmethod
     def _followed(self) -> tuple[float, bool, bool, Callable[[], bool]]:

@@ -62,9 +62,7 @@ class Stops:
 
     def end(self, name: str, position: float | None = None) -> bool:
         """How a motion ends that was stopped at `position`, m, or None in a search: not yet while it is given (False).
-
-        Raises `Aborted` once it was taken, `DeviceFault` where nobody knows that it was.
-        """
+        Raises `Aborted` once it was taken, `DeviceFault` where nobody knows that it was."""
         if self._given:
             return False
         at = "" if position is None else f"at {shown(position, 'm')} "

@@ -84,10 +84,8 @@ class EvenMotion:
 
     @classmethod
     def of(cls, times: Vector, positions: Vector, round_trips: Vector) -> Self:
-        """From (n,) readings: host time of the middle of the round trip in s, position in m, round trip in s.
-
-        The line is that of `fit_line`, moved to where the readings confine it should it lie outside.
-        """
+        """From (n,) readings: host time of the middle of the round trip in s, position in m, round trip in s. The line
+        is that of `fit_line`, moved to where the readings confine it should it lie outside."""
         origin, velocity = fit_line(times, positions, round_trips)
         best = np.argsort(round_trips, kind="stable")[:_MOST]
         before, after = (times + 0.5 * round_trips * sign for sign in (-1.0, 1.0))

@@ -72,9 +72,7 @@ _opening = threading.Lock()
 
 class RelayPort:
     """The port at `url` as one device uses it: errors carry its `name`, `kind` ("laser", "claw") begins their codes.
-
-    Raises `NotConnectedError`, and `ConfigError` when another device has the same port open at another speed.
-    """
+    Raises `NotConnectedError`, and `ConfigError` when another device has the same port open at another speed."""
 
     def __init__(self, name: str, kind: str, url: str, *, baud: int) -> None:
         self.name = name
@@ -126,10 +124,8 @@ class RelayPort:
     def ask(
         self, request: bytes, end: bytes, decode: Callable[[bytes], Answer], wanted: Callable[[], None] = lambda: None
     ) -> tuple[Answer, float]:
-        """Send `request`, read up to `end`: the decoded reply, and the round trip in wall seconds.
-
-        What is sent has to mean the same when it is heard twice: a lost or damaged reply is asked for again.
-        """
+        """Send `request`, read up to `end`: the decoded reply, and the round trip in wall seconds. What is sent has to
+        mean the same when it is heard twice: a lost or damaged reply is asked for again."""
         failure = BadRelayReply("nothing came")
         for attempt in range(_ATTEMPTS):
             if attempt:
@@ -230,10 +226,8 @@ class RelayWiring(Protocol):
         """One harmless round trip in wall seconds; of a board that never answers, that its port is there: 0 s."""
 
     def switch(self, relay: int, on: bool, wanted: Callable[[], None] = lambda: None) -> None:
-        """Set a relay, and see that it took it where the board can be asked.
-
-        `wanted` raises, before each attempt, where it is not any more.
-        """
+        """Set a relay, and see that it took it where the board can be asked. `wanted` raises, before each attempt,
+        where it is not any more."""
 
     def shows(self, relay: int) -> bool:
         """What a relay shows; `DeviceFault` (KIND.unknown) where nobody can know."""
@@ -366,9 +360,7 @@ def _lcus(relay: int, on: bool) -> bytes:
 
 def open_board(name: str, kind: str, make: str, url: str, *, baud: int) -> NumatoBoard | LcusBoard:
     """The board of that make ("numato", "lcus") at `url`, as the device `name` of that kind ("laser", "claw") uses it.
-
-    Raises `NotConnectedError` when there is no port, `DeadlineError` when a board that can be asked does not answer.
-    """
+    Raises `NotConnectedError` when there is no port, `DeadlineError` when a board that can be asked does not answer."""
     return (
         open_numato(name, kind, url, baud=baud)
         if make == "numato"
@@ -407,11 +399,8 @@ class _OnBoard:
 
 
 class BoardLaser(_OnBoard):
-    """A line laser on a relay of `board`, on while the relay is on.
-
-    A relay that cannot be read back is switched off on connecting, unless with `control=False` the board is only looked
-    at: then nothing is sent but questions.
-    """
+    """A line laser on a relay of `board`, on while the relay is on. A relay that cannot be read back is switched off on
+    connecting, unless with `control=False` the board is only looked at: then nothing is sent but questions."""
 
     def __init__(self, board: RelayWiring, relay: int, *, control: bool = True) -> None:
         super().__init__(board, relay)
@@ -480,11 +469,8 @@ class BoardLaser(_OnBoard):
         self._board.switch(self._relay, False)
 
     def close(self) -> None:
-        """Laser off, unless it is only looked at, then release the board.
-
-        Where it cannot be switched off the port and the helper stay: the next call, the end of `lit` or the end of this
-        program tries again.
-        """
+        """Laser off, unless it is only looked at, then release the board. Where it cannot be switched off the port and
+        the helper stay: the next call, the end of `lit` or the end of this program tries again."""
         with self._ending:
             if self._released:
                 return

@@ -113,10 +113,8 @@ class AgilexVehicle:
         return Identity("AgileX v2", "", UNKNOWN, self._address)
 
     def ping(self) -> float:
-        """How long, in wall seconds, until it tells its motion next, which it does every 20 ms.
-
-        Nothing on the bus is answered by every model. Raises `DeadlineError` when nothing comes.
-        """
+        """How long, in wall seconds, until it tells its motion next, which it does every 20 ms. Nothing on the bus is
+        answered by every model. Raises `DeadlineError` when nothing comes."""
         before = self._clock.now()
         if not self._wait_for(partial(self._feedback.newer, "MotionState", before), REPLY_TIMEOUT_S):
             self._link.check()
@@ -146,9 +144,7 @@ class AgilexVehicle:
 
     def check(self) -> None:
         """Raise the `DeviceFault` that the vehicle shows now; see `MessageFeedback.check`. Returns at once otherwise.
-
-        One that somebody else commands or moves is out of command from then on, until it is enabled again.
-        """
+        One that somebody else commands or moves is out of command from then on, until it is enabled again."""
         self._check(driving=False)
 
     def _check(self, driving: bool) -> None:
@@ -164,11 +160,8 @@ class AgilexVehicle:
             raise
 
     def enable(self) -> None:
-        """Take command over CAN and release the brake; opens the bus again if it had failed.
-
-        Raises `DeviceFault` on an emergency stop or an error that does not clear, `DeadlineError` when the vehicle
-        does not change to CAN mode.
-        """
+        """Take command over CAN and release the brake; opens the bus again if it had failed. Raises `DeviceFault` on an
+        emergency stop or an error that does not clear, `DeadlineError` when the vehicle does not change to CAN mode."""
         ends = self._ends
         self._take_command()
         with self._command:
@@ -227,11 +220,8 @@ class AgilexVehicle:
             self._enabled = self._took_command = True
 
     def drive(self, speed: float, yaw_rate: float) -> None:
-        """Set the velocity, m/s and rad/s; must be renewed within 0.5 s or it becomes zero.
-
-        Raises `LimitError`, `InterlockError` before `enable()`, `DeviceFault` as `check` does, `Aborted` while a stop
-        is under way.
-        """
+        """Set the velocity, m/s and rad/s; must be renewed within 0.5 s or it becomes zero. Raises `LimitError`,
+        `InterlockError` before `enable()`, `DeviceFault` as `check` does, `Aborted` while a stop is under way."""
         speed = check_range(self.name, "speed", speed, low=-self._max_speed, high=self._max_speed, unit="m/s")
         yaw_rate = check_range(self.name, "yaw rate", yaw_rate, -self._max_yaw_rate, self._max_yaw_rate, unit="rad/s")
         self._link.require_unspoken()
@@ -252,10 +242,8 @@ class AgilexVehicle:
         raise InterlockError(self.name, f"{reason}, so it would not move. Call enable() first")
 
     def stop(self) -> None:
-        """Command zero at once and wait until the vehicle reports standstill; `DeadlineError` after 4 s.
-
-        With feedback of two vehicles nobody knows: `DeviceFault`.
-        """
+        """Command zero at once and wait until the vehicle reports standstill; `DeadlineError` after 4 s. With feedback
+        of two vehicles nobody knows: `DeviceFault`."""
         with self._command:
             self._velocity = (0.0, 0.0)
             self._stopping += 1
@@ -328,10 +316,8 @@ class AgilexVehicle:
                         self.statistics.count("keep_alive_failed")
 
     def _brake_against_others(self) -> None:
-        """Lock the brake at once, holding `_command`: against another's commands no zero leads to a standstill.
-
-        `state` tells of an unknown brake until `brake` or `enable`: another may have released it again.
-        """
+        """Lock the brake at once, holding `_command`: against another's commands no zero leads to a standstill. `state`
+        tells of an unknown brake until `brake` or `enable`: another may have released it again."""
         self._velocity, self._braked = (0.0, 0.0), True
         self._alarms = self._feedback.alarms
         self._send_velocity()

@@ -24,10 +24,8 @@ def load_database() -> Database:
 
 
 class AgilexLink(CanLink):
-    """A `CanLink`; `told` is called with each known message's name and signal values.
-
-    `wanted` names the messages that are decoded; others are ignored. Raises what `CanLink` does.
-    """
+    """A `CanLink`; `told` is called with each known message's name and signal values. `wanted` names the messages that
+    are decoded; others are ignored. Raises what `CanLink` does."""
 
     def __init__(
         self, name: str, interface: str, channel: str, *, bitrate: int,

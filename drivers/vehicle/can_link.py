@@ -74,10 +74,8 @@ class CanLink:
         return self._failure is None and self._thread.is_alive()
 
     def check(self) -> None:
-        """Raise `NotConnectedError` after `close`, `DeviceFault` (vehicle.link_lost) when the bus has failed.
-
-        A bus that failed says so also once it was closed, so that one that cannot be opened again yet is tried later.
-        """
+        """Raise `NotConnectedError` after `close`, `DeviceFault` (vehicle.link_lost) when the bus has failed. A bus
+        that failed says so also once it was closed, so that one that cannot be opened again yet is tried later."""
         if self._closing.is_set() and self._failure is None:
             raise NotConnectedError(self._name, "the vehicle was closed. Open it again")
         if not self.alive:
@@ -113,10 +111,8 @@ class CanLink:
             self.check()
 
     def say_in_the_end(self, frames: Sequence[can.Message]) -> None:
-        """These frames are sent when this process is killed; a second call changes nothing.
-
-        Nothing where the bus has no file of its own: there the vehicle has to stop by itself.
-        """
+        """These frames are sent when this process is killed; a second call changes nothing. Nothing where the bus has
+        no file of its own: there the vehicle has to stop by itself."""
         if self._last_words is None:
             self._last_words = self._after_death(frames)
 

@@ -36,10 +36,8 @@ OUT_OF_COMMAND = ("vehicle.command_lost", "vehicle.disturbed", "vehicle.two_vehi
 
 
 def system_trouble(bits: int, *, commanded: bool) -> tuple[str, ...]:
-    """What the error bits of the system state (0x211) say that ends motion; empty when there is nothing.
-
-    `commanded` says whether this program is in command by now.
-    """
+    """What the error bits of the system state (0x211) say that ends motion; empty when there is nothing. `commanded`
+    says whether this program is in command by now."""
     return _words(bits & ~WARNINGS & ~(0 if commanded else UNCOMMANDED) & 0xFFFF, _SYSTEM, 4)
 
 
@@ -100,10 +98,8 @@ def vehicle_error(name: str, bits: int, trouble: tuple[str, ...], *, driven: boo
 
 
 def drive_error(name: str, text: str, *, driven: bool, more: str = ".") -> DeviceFault:
-    """The fault of a vehicle or a drive that reports one, with `more` in its hint where it was not `driven`.
-
-    One that came while it was driven may be a collision: that is for a person to look at, not for a program to clear.
-    """
+    """The fault of a vehicle or a drive that reports one, with `more` in its hint where it was not `driven`. One that
+    came while it was driven may be a collision: that is for a person to look at, not for a program to clear."""
     hint = (
         "It was driving: look what it may have driven against, and jog it away from there. Then run the job again."
         if driven

@@ -24,10 +24,8 @@ _HALF = 1 << 31
 
 
 class PlanarOdometry:
-    """Integrates the left and right odometers, signed 32-bit counters of `unit` m, for wheels `track` m apart.
-
-    `x`, `y` in m and `yaw` in rad in the frame where the vehicle stood at the first reading.
-    """
+    """Integrates the left and right odometers, signed 32-bit counters of `unit` m, for wheels `track` m apart. `x`, `y`
+    in m and `yaw` in rad in the frame where the vehicle stood at the first reading."""
 
     def __init__(self, track: float, unit: float = 1e-3) -> None:
         self._track = track
@@ -38,11 +36,8 @@ class PlanarOdometry:
         self.yaw = 0.0
 
     def update(self, left: int, right: int, farthest: float) -> bool:
-        """Take a reading; the counters may wrap.
-
-        False when a side has jumped by more than `farthest` m: the vehicle was restarted, and counting goes on from
-        this reading without the jump.
-        """
+        """Take a reading; the counters may wrap. False when a side has jumped by more than `farthest` m: the vehicle
+        was restarted, and counting goes on from this reading without the jump."""
         last, self._last = self._last, (left, right)
         if last is None:
             return True
@@ -240,10 +235,8 @@ class Feedback:
     def wait_for(
         self, happened: Callable[[], bool], timeout: float, alive: Callable[[], bool], floor: float = WALL_FLOOR_S
     ) -> bool:
-        """Wait until news make `happened` true; False when they do not or `alive` turns false.
-
-        At most `timeout` s, or `floor` s on the wall if that is longer.
-        """
+        """Wait until news make `happened` true; False when they do not or `alive` turns false. At most `timeout` s, or
+        `floor` s on the wall if that is longer."""
         deadline = self._clock.now() + max(timeout, floor * self._clock.rate)
         with self._news:
             while not happened():
@@ -254,10 +247,8 @@ class Feedback:
         return True
 
     def _require_young(self, told: float, max_age: float) -> None:
-        """`DeadlineError` when what was told at host time `told` is older than `max_age` s.
-
-        On a clock that runs faster than the wall, no age below 0.2 s of the wall counts as old.
-        """
+        """`DeadlineError` when what was told at host time `told` is older than `max_age` s. On a clock that runs faster
+        than the wall, no age below 0.2 s of the wall counts as old."""
         if self._clock.rate > 1.0:
             max_age = max(max_age, FAST_AGE_WALL_S * self._clock.rate)
         age = self._clock.now() - told
@@ -378,10 +369,8 @@ class MessageFeedback(Feedback):
         return bool(self._travel.two_vehicles) or self.stands(since)
 
     def state(self, max_age: float, braked: bool | None) -> VehicleState:
-        """All as one record; `DeadlineError` when it is older than `max_age` s.
-
-        Vehicle state and voltage, which come every 0.1 s, may be 0.2 s older; see `_require_young`.
-        """
+        """All as one record; `DeadlineError` when it is older than `max_age` s. Vehicle state and voltage, which come
+        every 0.1 s, may be 0.2 s older; see `_require_young`."""
         with self._news:
             (moved, motion), (counted, _), (reported, system) = (self._newest[message] for message in CYCLIC)
             travel = self._travel

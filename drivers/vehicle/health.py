@@ -85,10 +85,8 @@ Heard = Sequence[tuple[float, can.Message]]
 def readings(
     heard: Heard, seconds: float, bitrate: float, database: Database, interface: CanInterface | None, judge_times: bool
 ) -> list[Reading]:
-    """Figures of what was heard in `seconds` of the clock, and of the computer's `interface`, where it has one.
-
-    Without `judge_times`, on a clock that is not the wall's, times and load have no limits.
-    """
+    """Figures of what was heard in `seconds` of the clock, and of the computer's `interface`, where it has one. Without
+    `judge_times`, on a clock that is not the wall's, times and load have no limits."""
     own = database.get_message_by_name(EVEN).frame_id
     arrived = [stamp for stamp, frame in heard if frame.arbitration_id == own and _of_the_vehicle(frame)]
     period = float(np.percentile(np.diff(arrived), 99)) if len(arrived) > 1 else np.nan

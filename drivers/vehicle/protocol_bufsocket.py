@@ -38,9 +38,7 @@ class Serial(SocketPort):
 
     def write(self, data: Any) -> int:
         """Send all of `data`; raises when the other end takes none of it for as long as the port's write timeout says.
-
-        Raises SerialTimeoutException then, SerialException when the connection is lost.
-        """
+        Raises SerialTimeoutException then, SerialException when the connection is lost."""
         if not self.is_open:
             raise PortNotOpenError
         left, timeout = memoryview(data), self.write_timeout

@@ -17,10 +17,8 @@ SINGLE_THREADED = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def over_cores(tasks: Sequence[Task], workers: int = 0, ended: Callable[[Any], None] = lambda made: None) -> list[Any]:
-    """What each task makes, in their order; `ended` gets each as soon as it is there.
-
-    `workers` processes, by default one a core. What a task raises is raised here; those that wait are then dropped.
-    """
+    """What each task makes, in their order; `ended` gets each as soon as it is there. `workers` processes, by default
+    one a core. What a task raises is raised here; those that wait are then dropped."""
     # One thread a process: the sums, and so the figures, are then the same on every machine and the cores are full.
     for name in SINGLE_THREADED:
         os.environ.setdefault(name, "1")

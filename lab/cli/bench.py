@@ -20,10 +20,8 @@ WorkersOption = Annotated[int, typer.Option("--workers", min=0, max=64, help="Pr
 
 @bench.command()
 def acceptance(seed: SeedOption = 1, level: LevelOption = Level.nominal, json: JsonOption = False) -> None:
-    """Probing error, sphere spacing error and flatness after VDI/VDE 2634 part 2 and ISO 10360-13, simulated.
-
-    A ball at ten places of the measuring volume, a ball bar at seven, a flat at six; the worst place counts.
-    """
+    """Probing error, sphere spacing error and flatness after VDI/VDE 2634 part 2 and ISO 10360-13, simulated. A ball at
+    ten places of the measuring volume, a ball bar at seven, a flat at six; the worst place counts."""
     from lab.bench.acceptance.campaign import PLACES
     from lab.bench.acceptance.campaign import acceptance as campaign
 
@@ -71,10 +69,8 @@ def board(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """How surely boards are found, under which name their points, how exactly, and whether the covariance is true.
-
-    Exit code 1 when a board, or the order of its points, was taken for another.
-    """
+    """How surely boards are found, under which name their points, how exactly, and whether the covariance is true. Exit
+    code 1 when a board, or the order of its points, was taken for another."""
     from cell.measure.vision.board.view import KINDS
     from drivers.errors import ConfigError
     from lab.bench.board.campaign import campaign
@@ -97,10 +93,8 @@ def calibration(
     seeds: Annotated[int, typer.Option(min=2, max=1000, help="How many heads are drawn and calibrated.")] = 30,
     json: JsonOption = False,
 ) -> None:
-    """Calibrate many drawn scan heads and compare errors, z-scores and chi² with what the noise allows.
-
-    The observations are drawn by code that shares nothing with the estimator; all figures are of simulation.
-    """
+    """Calibrate many drawn scan heads and compare errors, z-scores and chi² with what the noise allows. The
+    observations are drawn by code that shares nothing with the estimator; all figures are of simulation."""
     from lab.bench.calibration.campaign import campaign
     from lab.bench.calibration.world import Noise
 
@@ -169,11 +163,8 @@ def placed(
     workers: WorkersOption = 0,
     json: JsonOption = False,
 ) -> None:
-    """Put effects between surface and part that nobody sees before it is placed, and hold what is seen then against
-    the truth.
-
-    Exit code 1 when a part was placed whose true error exceeds the stated bound.
-    """
+    """Put effects between surface and part that nobody sees before it is placed, and hold what is seen then against the
+    truth. Exit code 1 when a part was placed whose true error exceeds the stated bound."""
     from lab.bench.job.part_effects import EFFECTS
     from lab.bench.job.placed_part import campaign
 
@@ -244,10 +235,8 @@ def schedules(
     workers: WorkersOption = 0,
     json: JsonOption = False,
 ) -> None:
-    """Draw schedules of faults and people's acts, run whole jobs by them, and judge them by the world's truth.
-
-    Exit code 1 when a rule was broken; the smallest schedule that breaks it is shown with the command that repeats it.
-    """
+    """Draw schedules of faults and people's acts, run whole jobs by them, and judge them by the world's truth. Exit
+    code 1 when a rule was broken; the smallest schedule that breaks it is shown with the command that repeats it."""
     import tempfile
     from pathlib import Path
 
@@ -285,9 +274,7 @@ def planner(
     json: JsonOption = False,
 ) -> None:
     """How many random pairs of free postures the planner joins, how fast, how far apart, beside OMPL's own planners.
-
-    Exit code 1 when it joins less than 99.5 % of those that have a way, or bodies come closer than 5 mm.
-    """
+    Exit code 1 when it joins less than 99.5 % of those that have a way, or bodies come closer than 5 mm."""
     from lab.bench.job.planner import planner as campaign
 
     with bar() as told:
@@ -301,10 +288,8 @@ def servo(
     seed: SeedOption = 1,
     json: JsonOption = False,
 ) -> None:
-    """Stream to a simulated arm, first alone, then beside perception; exit 1 if that missed and a bare loop did not.
-
-    On a machine where a loop that only sleeps is late as well, there is no verdict: the figures say so.
-    """
+    """Stream to a simulated arm, first alone, then beside perception; exit 1 if that missed and a bare loop did not. On
+    a machine where a loop that only sleeps is late as well, there is no verdict: the figures say so."""
     from lab.bench.wires.servo import measure
 
     with bar() as told:
@@ -317,9 +302,7 @@ def outdoor(
     seeds: WorldsOption = 3, job: JobOption = "pot", workers: WorkersOption = 0, json: JsonOption = False
 ) -> None:
     """Jobs under 0 to 100 klx of sun with a moving shadow, wind and uneven ground; with a band-pass filter and without.
-
-    Exit code 1 when a part was placed outside the job's tolerance.
-    """
+    Exit code 1 when a part was placed outside the job's tolerance."""
     from lab.bench.job.outdoor import KLX, campaign
 
     with bar() as told:
@@ -374,10 +357,8 @@ def interim(
     workers: WorkersOption = 0,
     json: JsonOption = False,
 ) -> None:
-    """Plant twelve shifts in many calibrated cells, and look at the fine board as a job does before it begins.
-
-    Exit code 1 when a cell that nobody touched is called changed.
-    """
+    """Plant twelve shifts in many calibrated cells, and look at the fine board as a job does before it begins. Exit
+    code 1 when a cell that nobody touched is called changed."""
     from lab.bench.calibration.interim import UNTOUCHED, campaign
 
     with bar() as told:

@@ -18,10 +18,8 @@ paper = typer.Typer(help="The paper, reproduced: its design study and table.", n
 
 @paper.command()
 def figure2(json: JsonOption = False, out: OutOption = None) -> None:
-    """Figure 2: error over the sensor for 30 and 35 mm of baseline, light on it, and which rule chooses 35 mm.
-
-    With --out it also draws figure2_errors.png.
-    """
+    """Figure 2: error over the sensor for 30 and 35 mm of baseline, light on it, and which rule chooses 35 mm. With
+    --out it also draws figure2_errors.png."""
     from lab.paper.figure2 import figure2 as numbers
 
     _show(numbers(), json, out, "figure2")

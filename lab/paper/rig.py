@@ -47,10 +47,8 @@ DIRECTIONS = 300
 
 @dataclass(frozen=True)
 class RigSpec:
-    """The drawing of a scan head: m, px; `meeting` is where light plane and optical axis meet.
-
-    `depths` (nearest, farthest) are where the board is shown, `travel` is the rail's, `views` the calibration's poses.
-    """
+    """The drawing of a scan head: m, px; `meeting` is where light plane and optical axis meet. `depths` (nearest,
+    farthest) are where the board is shown, `travel` is the rail's, `views` the calibration's poses."""
 
     width: int = 640
     height: int = 480
@@ -246,10 +244,8 @@ def in_scan_frame(geometry: ScanGeometry) -> ScanGeometry:
 
 
 def expected_length(covariances: Array) -> float:
-    """Mean over points of the mean length in m of a Gaussian error with each of the `covariances` (n, 3, 3) in m².
-
-    A standard normal vector is a length of mean √(8/π) times an independent direction u, so E‖A g‖ = √(8/π) E‖A u‖.
-    """
+    """Mean over points of the mean length in m of a Gaussian error with each of the `covariances` (n, 3, 3) in m². A
+    standard normal vector is a length of mean √(8/π) times an independent direction u, so E‖A g‖ = √(8/π) E‖A u‖."""
     k = np.arange(DIRECTIONS) + 0.5
     height, turn = 1 - 2 * k / DIRECTIONS, np.pi * (1 + np.sqrt(5)) * k
     flat = np.sqrt(1 - height**2)

@@ -254,10 +254,8 @@ class DirectArm(DirectDevice):
         return bool(self.model.digital_inputs >> index & 1)
 
     def recover(self, *, confirmed: bool = False) -> None:
-        """Unlock a protective stop that a person has `confirmed`, which takes its time; the safe outputs go off.
-
-        Ended by `stop()`, with `Aborted`.
-        """
+        """Unlock a protective stop that a person has `confirmed`, which takes its time; the safe outputs go off. Ended
+        by `stop()`, with `Aborted`."""
         stops = self._stops
         self._require_remote()
         for index in (*self._safe_off, *self._tried):

@@ -117,10 +117,8 @@ class DirectCamera(DirectDevice):
         self.stop()
 
     def expose(self, begin: float, deadline: float) -> Frame | None:
-        """The frame whose exposure begins at `begin`, once that is over; None when its picture is lost.
-
-        `DeadlineError` when none can come by `deadline`.
-        """
+        """The frame whose exposure begins at `begin`, once that is over; None when its picture is lost. `DeadlineError`
+        when none can come by `deadline`."""
         exposure, spec = self.model.exposure, self.model.spec
         if self.model.silent or begin + exposure > deadline:
             self.clock.sleep_until(deadline)

@@ -51,10 +51,8 @@ Ring = Callable[[], float | None]
 
 
 class VirtualClock(Clock):
-    """World time as the host's clock, at rate 1: whoever waits on it lets the world's time pass, tick by tick.
-
-    One thread moves the time at a time. A thread that looks around while it waits does so after each tick of its own.
-    """
+    """World time as the host's clock, at rate 1: whoever waits on it lets the world's time pass, tick by tick. One
+    thread moves the time at a time. A thread that looks around while it waits does so after each tick of its own."""
 
     def __init__(self, time: SteppedClock, tick: Callable[[float], None]) -> None:
         """`tick(until)` lets the world go on by one tick, at most to `until` s."""
@@ -85,9 +83,7 @@ class VirtualClock(Clock):
     @contextmanager
     def checking(self, check: Check) -> Iterator[None]:
         """Inside this context `check()` is called after each tick that this thread waits for, in place of an outer one.
-
-        What it raises comes out of the wait.
-        """
+        What it raises comes out of the wait."""
         outer = getattr(self._checking, "check", None)
         self._checking.check = check
         try:

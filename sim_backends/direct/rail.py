@@ -18,10 +18,8 @@ from sim_backends.models.rail import RailModel
 
 @dataclass(frozen=True)
 class RailSetup:
-    """How the rail is driven: m, m/s, m/s²; `reversed` turns its motor round.
-
-    `serial` is the number by which the cell knows it; None where it tells its own.
-    """
+    """How the rail is driven: m, m/s, m/s²; `reversed` turns its motor round. `serial` is the number by which the cell
+    knows it; None where it tells its own."""
 
     lead: float
     steps_per_turn: int

@@ -24,9 +24,7 @@ _FARTHEST_M = 0.5
 @dataclass(frozen=True)
 class VehicleSetup:
     """Limits in m/s and rad/s; its wheels are `track` m apart, `count` is the way, m, that its counters count in.
-
-    `make` is what it calls itself.
-    """
+    `make` is what it calls itself."""
 
     max_speed: float
     max_yaw_rate: float

@@ -178,10 +178,8 @@ class ArmModel:
         return self._truth.at(t)
 
     def body_frames(self) -> Matrix:
-        """The frames (7, 4, 4) of base, links and flange as the maker draws them, now; those of the links to some mm.
-
-        A factory's table has them where its common normals happen to lie, which may be far from the links.
-        """
+        """The frames (7, 4, 4) of base, links and flange as the maker draws them, now; those of the links to some mm. A
+        factory's table has them where its common normals happen to lie, which may be far from the links."""
         frames = self._drawn.frames(self.drive.q)
         frames[6] = self.reported_flange()
         return frames
@@ -265,10 +263,8 @@ class ArmModel:
 
     @property
     def felt(self) -> Vector:
-        """Wrench (6,) as reported: at the flange in base axes, with noise, less the wrench taken as zero.
-
-        The controller takes the weight away that it was told of; what it carries beyond that is felt.
-        """
+        """Wrench (6,) as reported: at the flange in base axes, with noise, less the wrench taken as zero. The
+        controller takes the weight away that it was told of; what it carries beyond that is felt."""
         return self.wrench + self._untold_weight() - self._force_zero
 
     def start(self, motion: SimulatedMotion) -> None:
@@ -318,10 +314,8 @@ class ArmModel:
             self.suspend()
 
     def unlock(self, at_once: bool = False) -> bool:
-        """Release a protective stop; False while it is younger than `unlock_delay`, unless `at_once`.
-
-        The dashboard makes its clients wait; the primary port does not.
-        """
+        """Release a protective stop; False while it is younger than `unlock_delay`, unless `at_once`. The dashboard
+        makes its clients wait; the primary port does not."""
         with self._lock:
             if self.safety is Safety.PROTECTIVE_STOP:
                 if not at_once and self.time - self._stopped_at < self.params.unlock_delay:

@@ -85,10 +85,8 @@ class Kinematics:
     def inverse(
         self, target: Matrix, near: Vector, limit: float = 2 * math.pi, tolerance: float = 1e-9
     ) -> Vector | None:
-        """Joint angles (6,) within ±`limit` that reach `target` (4, 4), next to `near`; None without any.
-
-        `tolerance` bounds the remaining position error in m and rotation error in rad.
-        """
+        """Joint angles (6,) within ±`limit` that reach `target` (4, 4), next to `near`; None without any. `tolerance`
+        bounds the remaining position error in m and rotation error in rad."""
         for offset in _RESTARTS:
             q = self._descend(target, near + offset, tolerance)
             if q is not None:
@@ -120,10 +118,8 @@ class Kinematics:
         return None
 
     def _chain(self, q: Vector) -> list[_Frame]:
-        """Axes and origins of the base and the six link frames.
-
-        Plain floats: on matrices this small they are several times faster than arrays, and the arm's tick rests on it.
-        """
+        """Axes and origins of the base and the six link frames. Plain floats: on matrices this small they are several
+        times faster than arrays, and the arm's tick rests on it."""
         frames = [_BASE]
         x0, x1, x2, y0, y1, y2, z0, z1, z2, p0, p1, p2 = _BASE
         for angle, (a, d, ca, sa, offset) in zip(q.tolist(), self._links, strict=True):
@@ -216,10 +212,8 @@ GEAR_RATIO = 101.0
 
 @dataclass(frozen=True, eq=False)
 class JointErrors:
-    """`harmonics` (6, 4): sine and cosine of one turn of the motor, then of two, rad; `compliance` in rad/(N m).
-
-    The flange carries `mass` kg at its origin.
-    """
+    """`harmonics` (6, 4): sine and cosine of one turn of the motor, then of two, rad; `compliance` in rad/(N m). The
+    flange carries `mass` kg at its origin."""
 
     kinematics: Kinematics
     harmonics: Matrix

@@ -314,9 +314,7 @@ class LinearSpeed(SimulatedMotion):
 
 class ForceMode(SimulatedMotion):
     """Compliant along selected axes of `task` (4, 4): moves until the tool presses with `wrench` (6,) there.
-
-    `selection` (6,) is 1 for compliant axes, which move at most with `limits` (6,) m/s, rad/s; the others hold.
-    """
+    `selection` (6,) is 1 for compliant axes, which move at most with `limits` (6,) m/s, rad/s; the others hold."""
 
     feels_force = True
 

@@ -8,10 +8,8 @@ from sim_backends.faults import CAMERA_FAULTS as FAULTS
 
 @dataclass(frozen=True)
 class CameraSpec:
-    """What the camera is. The device clock reads `epoch` s at world time 0 and runs `drift_ppm` fast.
-
-    `latency` (s) is by how much the time stamps are later than the exposures really began.
-    """
+    """What the camera is. The device clock reads `epoch` s at world time 0 and runs `drift_ppm` fast. `latency` (s) is
+    by how much the time stamps are later than the exposures really began."""
 
     model: str
     serial: str
@@ -69,9 +67,7 @@ class CameraState:
 
     def fault(self, name: str, count: int) -> None:
         """`camera.frame_loss`: the next `count` exposures are lost; `camera.silent`: says nothing until `clear()`.
-
-        Raises ValueError for a name that is not in `FAULTS`.
-        """
+        Raises ValueError for a name that is not in `FAULTS`."""
         if name not in FAULTS:
             raise ValueError(f"unknown camera fault {name!r}; known: {', '.join(FAULTS)}")
         with self._lock:

@@ -42,10 +42,8 @@ class Track:
             return self._rows[-1][0] if self._rows else -math.inf
 
     def at(self, t: float) -> Vector:
-        """The values (n,) at world time `t`; the nearest reading's before the first and after the newest.
-
-        Raises LookupError while there is none.
-        """
+        """The values (n,) at world time `t`; the nearest reading's before the first and after the newest. Raises
+        LookupError while there is none."""
         (t0, before), (t1, after) = self._around(t)[1:3]
         return before if t1 <= t0 else before + (after - before) * ((t - t0) / (t1 - t0))
 
@@ -60,10 +58,8 @@ class Track:
         return t1 - t0
 
     def doubt(self, t: float) -> float:
-        """By how much the straight line around `t` may be off, by how its slope differs from its neighbours'.
-
-        Infinite as long as there is no reading after those two.
-        """
+        """By how much the straight line around `t` may be off, by how its slope differs from its neighbours'. Infinite
+        as long as there is no reading after those two."""
         rows = self._around(t)
         (t0, before), (t1, after) = rows[1:3]
         if t1 <= t0 or np.array_equal(before, after):
@@ -95,10 +91,8 @@ class Track:
 
 
 class FollowedArm(ArmModel):
-    """The arm at the joint angles that the real one measures, with the table that its controller tells.
-
-    What that table leaves, and the repeatability, are this world's own: nobody can measure those of the real arm.
-    """
+    """The arm at the joint angles that the real one measures, with the table that its controller tells. What that table
+    leaves, and the repeatability, are this world's own: nobody can measure those of the real arm."""
 
     def take_table(self, table: Matrix) -> None:
         """The controller's table (6, 4): a and d in m, alpha and joint offset in rad."""
@@ -150,9 +144,7 @@ class FollowedRail(RailModel):
 
 class FollowedVehicle(VehicleModel):
     """The vehicle where the real one's odometry puts it, from this world's start on; it leans as this world draws it.
-
-    `shift` (4, 4) moves it as a whole in the world: when somebody has measured where the station stands before it.
-    """
+    `shift` (4, 4) moves it as a whole in the world: when somebody has measured where the station stands before it."""
 
     def __init__(self, params: VehicleParams, rng: np.random.Generator) -> None:
         super().__init__(params, rng)

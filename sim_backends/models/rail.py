@@ -172,10 +172,7 @@ class RailModel:
 
     def fault(self, name: str, t: float) -> None:
         """Until `clear`: the wires of the limit switches are exchanged, or the motor loses a tenth of its steps on its
-        way to the right.
-
-        Raises ValueError for a name that is not in `FAULTS`.
-        """
+        way to the right. Raises ValueError for a name that is not in `FAULTS`."""
         if name not in FAULTS:
             raise ValueError(f"unknown rail fault {name!r}; known: {', '.join(FAULTS)}")
         self._have(t, self._faults | {name})

@@ -10,9 +10,7 @@ from dataclasses import dataclass
 @dataclass(frozen=True)
 class Screw:
     """Screw of `lead` m per turn; `scale_error` is relative, `periodic` (m) and `backlash` (m) are amplitude and width.
-
-    The phase is that of the periodic error in rad.
-    """
+    The phase is that of the periodic error in rad."""
 
     lead: float = 0.002
     scale_error: float = 0.0
@@ -94,9 +92,7 @@ class Slopes:
 
 def to_position(t: float, x: float, v: float, target: float, speed: float, slopes: Slopes | float) -> list[Piece]:
     """The fastest way from (`x`, `v`) to rest at `target` within `speed` > 0 and `slopes`, one number for all of them.
-
-    A start that cannot stop before `target` overshoots and comes back, as the controller does.
-    """
+    A start that cannot stop before `target` overshoots and comes back, as the controller does."""
     if not isinstance(slopes, Slopes):
         slopes = Slopes(slopes, slopes)
     pieces: list[Piece] = []
@@ -165,10 +161,8 @@ def _brake(pieces: list[Piece], t: float, x: float, v: float, end: float, slopes
 
 
 def clip(pieces: list[Piece], limit: float, direction: int) -> tuple[list[Piece], float | None]:
-    """Cut a ramp where it would pass `limit` while moving in `direction` (−1 or +1), and stand there.
-
-    A ramp that is beyond the limit already cannot move further that way. Also returns the time of the cut, or None.
-    """
+    """Cut a ramp where it would pass `limit` while moving in `direction` (−1 or +1), and stand there. A ramp that is
+    beyond the limit already cannot move further that way. Also returns the time of the cut, or None."""
     for i, piece in enumerate(pieces):
         end = pieces[i + 1].t if i + 1 < len(pieces) else math.inf
         crossing = _crossing(piece, end, limit, direction)

@@ -68,10 +68,8 @@ class VehicleParams:
 
 @dataclass(frozen=True)
 class VehicleReadings:
-    """What the vehicle knows of itself: speeds in m/s and rad/s of the wheels, odometers of both sides in m.
-
-    `drivers` is the status of each motor's driver.
-    """
+    """What the vehicle knows of itself: speeds in m/s and rad/s of the wheels, odometers of both sides in m. `drivers`
+    is the status of each motor's driver."""
 
     state: ChassisState
     mode: Mode
@@ -164,10 +162,8 @@ class VehicleModel:
             self._motion_mode = motion_mode
 
     def command(self, t: float, speed: float, yaw_rate: float, hard: bool = False) -> None:
-        """Drive at `speed` m/s and `yaw_rate` rad/s until `command_timeout` has passed; ignored outside CAN mode.
-
-        With `hard` it slows down as its brakes would slow it.
-        """
+        """Drive at `speed` m/s and `yaw_rate` rad/s until `command_timeout` has passed; ignored outside CAN mode. With
+        `hard` it slows down as its brakes would slow it."""
         p = self.params
         with self._lock:
             self._advance(t)

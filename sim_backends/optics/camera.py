@@ -110,10 +110,8 @@ def distort_jacobian(x: float, y: float, k: Vector) -> tuple[float, float, float
 def step_on_plane(
     point: Vector, normal: Vector, du: float, dv: float, intrinsics: Vector
 ) -> tuple[float, float, float]:
-    """How a point (3,) on its tangent plane of this normal (3,) moves, m, as its picture moves by (du, dv) px.
-
-    Not finite where the plane is seen edge on.
-    """
+    """How a point (3,) on its tangent plane of this normal (3,) moves, m, as its picture moves by (du, dv) px. Not
+    finite where the plane is seen edge on."""
     z = point[2]
     x, y = point[0] / z, point[1] / z
     ux, uy, vx, vy = distort_jacobian(x, y, intrinsics)

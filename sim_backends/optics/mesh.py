@@ -59,10 +59,8 @@ class Mesh:
             capacity = count
 
     def hide(self, points: Vector, eye: Vector, start: float, seen: NDArray[np.bool_]) -> None:
-        """Clear `seen` (n,) where the mesh stands between `points` (n, 3) and `eye` (3,), all in the mesh frame.
-
-        Hits nearer than `start` (m) to the point do not count; a negative `start` makes a touching mesh count.
-        """
+        """Clear `seen` (n,) where the mesh stands between `points` (n, 3) and `eye` (3,), all in the mesh frame. Hits
+        nearer than `start` (m) to the point do not count; a negative `start` makes a touching mesh count."""
         shadow(self.corners, self.low, self.high, points=np.ascontiguousarray(points), eye=eye, start=start, seen=seen)
 
 

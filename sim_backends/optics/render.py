@@ -20,9 +20,7 @@ def render(
     rng: np.random.Generator, light: Light | None = None, speckle: np.random.Generator | None = None,
 ) -> NDArray[np.uint8]:  # fmt: skip
     """Picture (height, width) uint8 that the camera takes of `scene` with `exposure` seconds; `laser` None is off.
-
-    `speckle` draws the laser's speckle, which stays as it is while nothing moves; None: `rng`.
-    """
+    `speckle` draws the laser's speckle, which stays as it is while nothing moves; None: `rng`."""
     return sensor(expected_image(optics, scene, laser, exposure, speckle or rng, light=light), optics, rng)
 
 
@@ -30,10 +28,8 @@ def expected_image(
     optics: CameraOptics, scene: Sequence[SceneObject], laser: LaserOptics | None, exposure: float,
     rng: np.random.Generator, light: Light | None = None,
 ) -> Image:  # fmt: skip
-    """The light that `render` puts on the sensor, (height, width) float32 in DN, before noise and saturation.
-
-    Planes lie behind everything else, then the farther object is drawn first. `rng` draws the speckle only.
-    """
+    """The light that `render` puts on the sensor, (height, width) float32 in DN, before noise and saturation. Planes
+    lie behind everything else, then the farther object is drawn first. `rng` draws the speckle only."""
     if not exposure > 0:
         raise ValueError(f"exposure {exposure} s: must be above 0 s")
     light = Light() if light is None else light

@@ -32,9 +32,7 @@ class Peer(Protocol):
 
 class TcpServer:
     """Accepts clients on a free port of 127.0.0.1 and runs `handle(connection)` in a thread of its own for each.
-
-    `handle` returns when its connection ends; `stop()` shuts every connection down, so that reading from it ends.
-    """
+    `handle` returns when its connection ends; `stop()` shuts every connection down, so that reading from it ends."""
 
     def __init__(self, name: str, handle: Callable[[socket.socket], None]) -> None:
         self.name = name
@@ -184,10 +182,8 @@ ValueError, TypeError, KeyError or IndexError refuse the request.
 
 
 class JsonLinesPeer(TcpServer):
-    """Serves at `address` one JSON object per line each way: `operations` by the request's "op".
-
-    Replies are {"ok": true, …} or {"ok": false, "error": …}; arrays are told as lists.
-    """
+    """Serves at `address` one JSON object per line each way: `operations` by the request's "op". Replies are {"ok":
+    true, …} or {"ok": false, "error": …}; arrays are told as lists."""
 
     def __init__(self, name: str, operations: Mapping[str, Operation], longest: int = 64 * 1024) -> None:
         """A request is at most `longest` bytes."""

@@ -164,10 +164,8 @@ class Cameras:
         return replace(self._cold[camera], fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy)
 
     def _lit(self, camera_from_world: Pose, t: float) -> Light:
-        """The light with the sun's strip where it is at `t`: a hand's width, slowly along the table's x axis.
-
-        In the open the sky lights all, and the sun all beyond the edge of a shadow.
-        """
+        """The light with the sun's strip where it is at `t`: a hand's width, slowly along the table's x axis. In the
+        open the sky lights all, and the sun all beyond the edge of a shadow."""
         scene, suns = self._shown[0], []
         ground = camera_from_world @ scene.world_from_place
         if strength := scene.effects.sunlight:

@@ -264,10 +264,8 @@ Part = TypeVar("Part", bound=Drawing | CellDrawing | StationDrawing | CameraDraw
 
 
 def settled(drawn: Part, stock: Part) -> Part:
-    """`drawn` with the numbers of `stock` wherever both are the same as far as a text says it.
-
-    So a cell whose file writes out the stock cell is the stock cell to the last bit.
-    """
+    """`drawn` with the numbers of `stock` wherever both are the same as far as a text says it. So a cell whose file
+    writes out the stock cell is the stock cell to the last bit."""
     return replace(drawn, **{f.name: _settled(getattr(drawn, f.name), getattr(stock, f.name)) for f in fields(drawn)})
 
 

@@ -93,10 +93,8 @@ class Workshop:
 
 @dataclass(frozen=True)
 class Scene:
-    """Where everything really is. Poses are (4, 4), metres, named `a_from_b`; frames as in `drawing`.
-
-    The station carries table and surface: where `world_from_surface` is off, the table is off with it.
-    """
+    """Where everything really is. Poses are (4, 4), metres, named `a_from_b`; frames as in `drawing`. The station
+    carries table and surface: where `world_from_surface` is off, the table is off with it."""
 
     seed: int
     level: str
@@ -173,10 +171,8 @@ DOCKED = 0.1
 
 
 def draw(seed: int, level: str, drawing: Drawing = STOCK, parts: int = 0) -> Scene:
-    """Draw the world of `seed` at `level` around `drawing`; the claw holds its next part after so many `parts`.
-
-    Raises ValueError for an unknown level or a negative seed.
-    """
+    """Draw the world of `seed` at `level` around `drawing`; the claw holds its next part after so many `parts`. Raises
+    ValueError for an unknown level or a negative seed."""
     sigma, effects = deviations(level), effects_of(level)
     if drawing.cell.fixed:
         # No tyres, no springs, no way over the ground.

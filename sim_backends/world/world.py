@@ -257,10 +257,8 @@ class World:
         return self.switches[name] if output is None else bool(self.arm.digital_outputs >> output & 1)
 
     def switch(self, name: str, on: bool, since: float | None = None) -> None:
-        """The own switch of "laser" or "claw" is on or off: since now, or since a world time.
-
-        An arm that a real one moves is told of late: its tick would note the laser late as well.
-        """
+        """The own switch of "laser" or "claw" is on or off: since now, or since a world time. An arm that a real one
+        moves is told of late: its tick would note the laser late as well."""
         self.switches[name] = on
         if name == "laser":
             self.laser.record(self.clock.now() if since is None else since, on)
@@ -345,10 +343,8 @@ def make_rail(scene: Scene, made: type[RailModel] = RailModel) -> RailModel:
 
 
 def make_vehicle(scene: Scene, made: type[VehicleModel] = VehicleModel) -> VehicleModel:
-    """The vehicle standing at its start, braked for good where it is a fixed frame.
-
-    Its drift sideways and in yaw follow the odometry's errors.
-    """
+    """The vehicle standing at its start, braked for good where it is a fixed frame. Its drift sideways and in yaw
+    follow the odometry's errors."""
     start = scene.world_from_vehicle_start
     yaw = float(np.arctan2(start[1, 0], start[0, 0]))
     params = VehicleParams(

@@ -56,10 +56,8 @@ def described(folder: Path, config: Changes | None = None, job: Changes | None =
 
 
 def quick(text: str, rate: float = 30.0) -> str:
-    """A job's text swept twice as fast as shipped, with `rate` pictures a second.
-
-    With fewer than 20, lines lie farther apart than `scan.largest_hole`: a drawn part then hardly meets what was seen.
-    """
+    """A job's text swept twice as fast as shipped, with `rate` pictures a second. With fewer than 20, lines lie farther
+    apart than `scan.largest_hole`: a drawn part then hardly meets what was seen."""
     return changed(text, {"scan": {"speed": '"30 mm/s"', "frame_rate": f'"{rate:g} Hz"'}})
 
 

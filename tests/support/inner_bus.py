@@ -25,10 +25,8 @@ class Hand(Clock):
 
 
 class InnerBus:
-    """A virtual bus of python-can instead of the peer's adapters; `frames` are those that the driver has sent.
-
-    With `talking` False the vehicle's frames are lost.
-    """
+    """A virtual bus of python-can instead of the peer's adapters; `frames` are those that the driver has sent. With
+    `talking` False the vehicle's frames are lost."""
 
     def __init__(self, channel: str, receive: Callable[[CanFrame], None]) -> None:
         self.talking = True

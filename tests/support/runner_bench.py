@@ -24,9 +24,7 @@ POLICY = Policy(
 
 class Bench:
     """It notes what happened, in order. `given` are the steps' work, by name, and what the runner is given besides.
-
-    `unconfirmed` is how the reason of a safe stop begins that cannot be confirmed.
-    """
+    `unconfirmed` is how the reason of a safe stop begins that cannot be confirmed."""
 
     def __init__(self, folder, unconfirmed=None, **given):
         self.folder = folder

@@ -233,10 +233,8 @@ def _rail_places(workplace: CommissionWorkplace, eye: Eye) -> list[float]:
 
 
 def centred_view(workplace: CommissionWorkplace, result: Result, eye: Eye) -> SeenBoard:
-    """As `find_view`, with the middle of the board in the middle of the picture, at the eye's depth.
-
-    For a camera whose axes lie as they are drawn.
-    """
+    """As `find_view`, with the middle of the board in the middle of the picture, at the eye's depth. For a camera whose
+    axes lie as they are drawn."""
     seen = find_view(workplace, result, eye)
     at = seen.camera_from_board
     middle = at.rotation @ centre_of(eye.board) + at.translation
@@ -303,9 +301,7 @@ def solve_mounting(
     flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3], rotation: Array, scale: float
 ) -> RoughMounting:
     """Where a camera sits whose axes lie as `rotation` (3, 3), from views with turns of a few degrees about two axes.
-
-    One linear system for the camera's place on the flange and the board's in the base, `scale` being known.
-    """
+    One linear system for the camera's place on the flange and the board's in the base, `scale` being known."""
     rows = np.concatenate([np.column_stack([f.rotation, -np.eye(3)]) for f in flanges])
     told = [
         -f.translation - scale * f.rotation @ rotation @ b.translation for f, b in zip(flanges, boards, strict=True)
@@ -391,9 +387,7 @@ LEAST_TURNED = 4
 
 def measure(workplace: CommissionWorkplace, result: Result, eye: Eye) -> tuple[Axes, RoughMounting]:
     """How the camera's axes lie on the flange, then where it sits, and how large the board is by the arm's measure.
-
-    Raises `RefusedError` when the board is lost, or the views do not agree on one mounting.
-    """
+    Raises `RefusedError` when the board is lost, or the views do not agree on one mounting."""
     first = find_view(workplace, result, eye)
     workplace.keep(result, f"{eye.name}-board", first.frame, first.view.pixels)
     shifted = shifted_views(workplace, eye, first.base_from_flange, eye.step)
@@ -446,10 +440,8 @@ def poses_of(seen: Sequence[SeenBoard]) -> tuple[list[pin.SE3], list[pin.SE3]]:
 
 
 def _turned(eye: Eye, first: SeenBoard, hand: pin.SE3, scale: float, turn: float) -> list[pin.SE3]:
-    """base_from_flange that look at the middle of the board from the first view, turned about each of its axes.
-
-    `hand` is flange_from_camera as far as it is known, `scale` the board's.
-    """
+    """base_from_flange that look at the middle of the board from the first view, turned about each of its axes. `hand`
+    is flange_from_camera as far as it is known, `scale` the board's."""
     at = first.camera_from_board
     centre = at.rotation @ centre_of(eye.board) * scale + scale * at.translation
     depth = float(np.linalg.norm(centre))

@@ -41,10 +41,8 @@ WIDEST_PICTURE = 640
 
 
 class Person:
-    """Whoever stands beside the cell: confirms what is to move, says what sensors cannot see, lends a hand.
-
-    `ask` shows a text and gives yes or no.
-    """
+    """Whoever stands beside the cell: confirms what is to move, says what sensors cannot see, lends a hand. `ask` shows
+    a text and gives yes or no."""
 
     def __init__(self, ask: Callable[[str], bool]) -> None:
         self._ask = ask
@@ -103,9 +101,7 @@ class Declined(RefusedError):
 @dataclass
 class CommissionWorkplace:
     """`path` is the configuration's file, `open_cell` connects the cell as it now says. `folder` takes pictures.
-
-    `simulated`: all of its devices are, and their world can be told what to do.
-    """
+    `simulated`: all of its devices are, and their world can be told what to do."""
 
     path: Path
     open_cell: Callable[[], Cell]
@@ -188,10 +184,8 @@ class CommissionWorkplace:
             self.context.safe_point()
 
     def mover(self) -> Mover:
-        """Planned moves of the arm at the speed of somebody who stands beside it; the vehicle is braked first.
-
-        The claw may hold the job's part: ways keep clear of it either way.
-        """
+        """Planned moves of the arm at the speed of somebody who stands beside it; the vehicle is braked first. The claw
+        may hold the job's part: ways keep clear of it either way."""
         self.confirm(
             "the arm as a whole", "planned ways above the deck", "up to its whole reach",
             f"at most {math.degrees(SLOW_JOINT):.0f} deg/s and {1e3 * SLOW_TOOL:.0f} mm/s",

@@ -156,11 +156,8 @@ def told_by_few(seen: Sequence[SeenSurface], surface: NominalSurface) -> list[st
 
 
 def place_from(seen: Sequence[SeenSurface], nominal: NominalSurface, job: Job, config: CellConfig) -> PlacePose:
-    """The place as the job's own inversion would tell it from these sweeps, without noise.
-
-    Raises `NotObservable` that names the motion which surface and sweeps leave open, `RefusedError` when they cover
-    too little of the surface.
-    """
+    """The place as the job's own inversion would tell it from these sweeps, without noise. Raises `NotObservable` that
+    names the motion which surface and sweeps leave open, `RefusedError` when they cover too little of the surface."""
     cloud = as_cloud(list(seen), config.calibration.rail_sigma).require()
     arm = config.arm
     rest = np.diag([arm.repeatability**2] * 3 + [arm.repeatability_angle**2] * 3)

@@ -120,10 +120,8 @@ class Asker:
             self.notify(f"  {text} …")
 
     def get(self, option: str, question: str, default: str | None, parse: Callable[[str], T]) -> T:
-        """The answer to a question, by `parse`, which raises `ValueError` or `ConfigError` for a wrong one.
-
-        Raises `ConfigError` for a wrong option, and for a question without default that nobody answers.
-        """
+        """The answer to a question, by `parse`, which raises `ValueError` or `ConfigError` for a wrong one. Raises
+        `ConfigError` for a wrong option, and for a question without default that nobody answers."""
         text = self.given.get(option)
         if text is None and self.ask is None:
             if default is None:

@@ -68,9 +68,7 @@ def _enters(body: MeshBody, other: MeshBody, rays: Rays) -> bool:
 
 def before(vertices: Array, faces: Faces) -> tuple[NDArray[np.intp], list[Rays | None]]:
     """(m,) the body of each triangle, and for each body the earlier ones that its box meets, None where there are none.
-
-    A place of a body that lies on one of those is there twice.
-    """
+    A place of a body that lies on one of those is there twice."""
     body = np.unique(joined(faces, len(vertices)), return_inverse=True)[1].reshape(-1).astype(np.intp)
     parts = [faces[body == k] for k in range(int(body.max(initial=-1)) + 1)]
     corners = [vertices[part.ravel()] for part in parts]
@@ -96,11 +94,8 @@ LEAST_SEEN = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Laid:
-    """A mesh in the surface frame S: z up, the middle of its box at x = y = 0. m.
-
-    `surface_from_mesh` says where the file's own frame is, after its unit was turned into m; `foot` how far the table's
-    top is below the origin, m.
-    """
+    """A mesh in the surface frame S: z up, the middle of its box at x = y = 0. m. `surface_from_mesh` says where the
+    file's own frame is, after its unit was turned into m; `foot` how far the table's top is below the origin, m."""
 
     vertices: Array
     faces: Faces

@@ -85,10 +85,8 @@ class Rays:
         return np.asarray(self.hits(eyes, ways / length[:, None])[1] - length)
 
     def smooth_normals(self, triangles: NDArray[np.int64], points: Array) -> Array:
-        """Unit normals (n, 3) at points on triangles (n,), of the smooth surface that the triangles stand for.
-
-        By the flat triangles' own normals a round part would seem to tell how it is turned: only its facets do.
-        """
+        """Unit normals (n, 3) at points on triangles (n,), of the smooth surface that the triangles stand for. By the
+        flat triangles' own normals a round part would seem to tell how it is turned: only its facets do."""
         if self._smooth is None:
             self._smooth = _corner_normals(self._corners, self._faces, self.normals)
         a, b, c = self._corners[triangles].transpose(1, 0, 2)

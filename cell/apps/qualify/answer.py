@@ -278,9 +278,7 @@ def keep_line(answer: JobAnswer, job: str | Path, config: Path | None) -> Path:
 
 def kept_line(job: str | Path, config: Path | None) -> str | None:
     """The line of a job as it is now, or that it does not hold any more and why; None where nobody qualified it.
-
-    `config` is the file that a command was given. Nothing is raised: what is wrong with the files is told elsewhere.
-    """
+    `config` is the file that a command was given. Nothing is raised: what is wrong with the files is told elsewhere."""
     try:
         path = find_config(config, simulated=True)
         kept = read_json(line_file(job, path)).require()
@@ -337,10 +335,8 @@ class PairedComparison:
 
 
 def other_rows(campaign: Campaign, folder: Path) -> list[Row]:
-    """The rows in `folder` to compare with: of the same job and level, from the version that ran last.
-
-    In the campaign's own folder that is another code, job or configuration. `ConfigError` where there is none.
-    """
+    """The rows in `folder` to compare with: of the same job and level, from the version that ran last. In the
+    campaign's own folder that is another code, job or configuration. `ConfigError` where there is none."""
     if not (folder / ROWS).is_dir():
         raise ConfigError(f"--compare {folder}: it holds no campaign (there is no {folder / ROWS}); name its --out")
     rows = RowStore(folder).rows(job=campaign.of.job, level=campaign.level)

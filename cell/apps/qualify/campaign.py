@@ -141,9 +141,7 @@ class Campaign:
 
     def run(self, store: RowStore, opened: Callable[[], Workers], shown: Callable[[Prefix], None]) -> Prefix:
         """Run what is missing, keeping each row as it ends; `shown` is told after each. Workers are ended at the end.
-
-        Raises `CellError` where workers cannot go on; the rows that came are kept then, as after an interrupt.
-        """
+        Raises `CellError` where workers cannot go on; the rows that came are kept then, as after an interrupt."""
         with store.writing():
             prefix = self.known(store)
             shown(prefix)

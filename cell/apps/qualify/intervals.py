@@ -14,10 +14,8 @@ Z95 = 1.959964
 
 @dataclass(frozen=True)
 class Share:
-    """`count` of `of` worlds with the interval of the true share (Clopper and Pearson, Biometrika 26, 1934).
-
-    A mean share of points counts as that share of the worlds: a world's points are not independent.
-    """
+    """`count` of `of` worlds with the interval of the true share (Clopper and Pearson, Biometrika 26, 1934). A mean
+    share of points counts as that share of the worlds: a world's points are not independent."""
 
     count: float
     of: int
@@ -65,9 +63,7 @@ def mean_difference(differences: Sequence[float]) -> tuple[float, float | None, 
 
 def share_difference(better: int, worse: int, pairs: int) -> tuple[float, float, float]:
     """The difference of two shares of the same `pairs`, and its interval (Agresti and Min, Stat. Med. 24, 2005).
-
-    `better` pairs are good in the first only, `worse` in the second only.
-    """
+    `better` pairs are good in the first only, `worse` in the second only."""
     first, second, n = better + 0.5, worse + 0.5, pairs + 2.0
     centre = (first - second) / n
     half = Z95 * float(np.sqrt(first + second - (first - second) ** 2 / n)) / n

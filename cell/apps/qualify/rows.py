@@ -38,10 +38,8 @@ WORST_FIRST = ("error", "aborted", "faulted", "misplaced", "refused")
 
 
 def row_of(of: QualifiedCode, level: str, seed: int, reports: Sequence[Report], covered: float | None = None) -> Row:
-    """The row of a world whose runs left these `reports`, one for each item that was tried.
-
-    `covered` is the share of the part's points that ended within the stated bound.
-    """
+    """The row of a world whose runs left these `reports`, one for each item that was tried. `covered` is the share of
+    the part's points that ended within the stated bound."""
     worst = next((one for name in WORST_FIRST for one in reports if one["outcome"] == name), reports[-1])
     row = _first(of, level, seed) | {
         "outcome": str(worst["outcome"]), "step": _ended_in(worst), "code": str(worst.get("code") or ""),
@@ -118,10 +116,8 @@ def _keep_nearer(row: Row, figure: MeasuredRow) -> None:
 
 
 def used(name: str, value: float, limit: float, end: str) -> float:
-    """The share of its limit that a value of this column uses, 1 at the limit; `end` is that of the limit's column.
-
-    A share in % that has to be large is as good as can be at 100.
-    """
+    """The share of its limit that a value of this column uses, 1 at the limit; `end` is that of the limit's column. A
+    share in % that has to be large is as good as can be at 100."""
     if end == BOUNDS["at most"]:
         return abs(value) / limit if limit else float(value != 0.0)
     if shown(name)[1] == "%" and limit < 100.0:
@@ -211,10 +207,8 @@ class RowStore:
         self._small = len(self._files(small=True))
 
     def rows(self, **wanted: str) -> list[Row]:
-        """Each row once whose columns have the `wanted` values; columns that a row does not have are left out.
-
-        Raises `CellError` for a file that is none of Parquet.
-        """
+        """Each row once whose columns have the `wanted` values; columns that a row does not have are left out. Raises
+        `CellError` for a file that is none of Parquet."""
         found: dict[str, Row] = {}
         for row in _read(self._files()):
             if all(row.get(name) == value for name, value in wanted.items()):

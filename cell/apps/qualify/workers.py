@@ -190,10 +190,8 @@ class Cluster:
 
 
 def open_workers(count: int | None, scheduler: str | None, cluster: str | None) -> Workers:
-    """What `--workers`, `--scheduler` and `--cluster` name: by default a process for each core.
-
-    Raises `ConfigError` for what is none of these, for a missing package, and where no scheduler answers.
-    """
+    """What `--workers`, `--scheduler` and `--cluster` name: by default a process for each core. Raises `ConfigError`
+    for what is none of these, for a missing package, and where no scheduler answers."""
     if [count, scheduler, cluster].count(None) < 2:
         raise ConfigError("--workers, --scheduler and --cluster exclude each other; give one of them")
     if scheduler is not None:

@@ -67,10 +67,8 @@ class Fit:
 
     @property
     def boards_own(self) -> bool:
-        """True for poses of the board as the camera sees it, not of a flange.
-
-        The camera would sit in the base's origin; or, turned round, be the flange itself, and the board the base.
-        """
+        """True for poses of the board as the camera sees it, not of a flange. The camera would sit in the base's
+        origin; or, turned round, be the flange itself, and the board the base."""
         if not along_axes(self.hand.rotation) or np.linalg.norm(self.hand.translation) > OWN_SHARE * self.reach:
             return False
         if self.setup == "eye_to_hand":
@@ -246,10 +244,8 @@ def _same(a: Fit, b: Fit, boards: dict[int, list[pin.SE3]]) -> bool:
 def _fit(
     one: Series, reading: PoseReading, setup: str, flanges: Sequence[pin.SE3], options: Sequence[list[pin.SE3]]
 ) -> Fit:
-    """How well flange poses go with the boards, of each the poses that it may have.
-
-    Raises RefusedError where the turns tell nothing.
-    """
+    """How well flange poses go with the boards, of each the poses that it may have. Raises RefusedError where the turns
+    tell nothing."""
     seen = [views[turn] for views, turn in zip(options, orders(flanges, options), strict=True)]
     rotation, turn, kept = _rotation(flanges, seen)
     reach = float(np.median([np.linalg.norm(b.translation) for b in seen]))

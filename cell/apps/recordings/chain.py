@@ -49,9 +49,7 @@ Profiles = list[StripeProfile | None]
 @dataclass(frozen=True, eq=False)
 class StripesOnBoards:
     """The stripes of one light plane, its points (n, 3) in m on each board, and why others are left out, by place.
-
-    `problem` says why there is no plane.
-    """
+    `problem` says why there is no plane."""
 
     plane: PlaneStart | None
     profiles: Profiles
@@ -115,10 +113,8 @@ class CalibrationChain:
 def solve_chain(
     frames: Sequence[RecordedFrame], pictures: Intrinsics, setup: str, hold_camera: bool
 ) -> CalibrationChain:
-    """Closed form and joint solution with the camera on the flange, or standing before it, as `setup` says.
-
-    Raises RefusedError when there are too few frames, or they do not determine a hand-eye.
-    """
+    """Closed form and joint solution with the camera on the flange, or standing before it, as `setup` says. Raises
+    RefusedError when there are too few frames, or they do not determine a hand-eye."""
     if len(frames) < LEAST_FRAMES:
         raise RefusedError(
             f"{len(frames)} stops have a flange pose; a hand-eye that can be checked needs {LEAST_FRAMES} or more "
@@ -230,10 +226,8 @@ def report_chain(chain: CalibrationChain, pictures: Intrinsics, result: Recorded
 
 
 def _scatter(chain: CalibrationChain) -> tuple[float, float]:
-    """RMS in m and rad by which the boards lie off one place in the base.
-
-    Board and hand-eye belong to one camera: that which is reported.
-    """
+    """RMS in m and rad by which the boards lie off one place in the base. Board and hand-eye belong to one camera: that
+    which is reported."""
     state = chain.choice.best.adjusted.state
     boards = [
         o.base_from_flange * state.flange_from_camera * board_pose(o.view, state.camera).camera_from_board

@@ -52,9 +52,7 @@ class Options:
 
 def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | None = None) -> RecordedResult:
     """Calibrate from the pictures of a folder, or from its pairs of poses when `spec` is None or there are no pictures.
-
-    Raises ConfigError when there is nothing to read.
-    """
+    Raises ConfigError when there is nothing to read."""
     options = options or Options()
     check_reading(options.poses)
     listing = list_folder(folder)
@@ -156,10 +154,8 @@ class Understood:
 def attach_poses(
     frames: Sequence[RecordedFrame], series: Sequence[Series], camera: CameraModel | None, options: Options
 ) -> Understood:
-    """Set each frame's pose, in m, by the reading that agrees with the boards in the pictures, and tell how.
-
-    Without a camera, or with fewer than three frames, nothing is decided and no frame gets a pose.
-    """
+    """Set each frame's pose, in m, by the reading that agrees with the boards in the pictures, and tell how. Without a
+    camera, or with fewer than three frames, nothing is decided and no frame gets a pose."""
     if options.pose_field is not None:
         names = ", ".join(s.name for s in series)
         series = [s for s in series if s.name == options.pose_field]

@@ -84,10 +84,8 @@ def refuse_odd_ones(frames: Sequence[RecordedFrame], camera: CameraModel) -> lis
 
 
 def refuse_misplaced(frames: Sequence[RecordedFrame], camera: CameraModel) -> list[RecordedFrame]:
-    """Refuse frames whose flange pose puts the board far from where the others see it; the rest.
-
-    Frames of one stop are judged as one.
-    """
+    """Refuse frames whose flange pose puts the board far from where the others see it; the rest. Frames of one stop are
+    judged as one."""
     stops = by_stop(frames)
     boards, flanges = _poses([merged(stop) for stop in stops], camera)
     for k, (off, others) in misplacements(flanges, boards).items():
@@ -102,10 +100,8 @@ def refuse_misplaced(frames: Sequence[RecordedFrame], camera: CameraModel) -> li
 
 
 def odd_turns(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> dict[int, float]:
-    """The frames that disagree about the turns with most others, worst first, and by how much in rad.
-
-    Nothing is odd where most frames disagree with most others: then it is the poses that are read wrongly.
-    """
+    """The frames that disagree about the turns with most others, worst first, and by how much in rad. Nothing is odd
+    where most frames disagree with most others: then it is the poses that are read wrongly."""
     count = len(flanges)
     apart, votes = np.abs(turns_between(flanges) - turns_between(boards)), turn_votes(flanges, boards)
     odd: dict[int, float] = {}
@@ -124,9 +120,7 @@ def odd_turns(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> dict[int
 
 def misplacements(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> dict[int, tuple[float, float]]:
     """The frames that put the board elsewhere than most, worst first: how far in m, and how well the others agree.
-
-    Nothing is misplaced where no hand-eye can be had, or where most frames would be.
-    """
+    Nothing is misplaced where no hand-eye can be had, or where most frames would be."""
     index, found = list(range(len(flanges))), {}
     # Frames of one orientation put the board wherever the hand-eye has it: they tell little of what is usual.
     votes = turn_votes(flanges, boards)
@@ -153,10 +147,8 @@ def _poses(frames: Sequence[RecordedFrame], camera: CameraModel) -> tuple[list[p
 
 
 def _misplacements(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> tuple[Array, Array]:
-    """How far each frame's board (n,) lies from where most put it, and from the camera (n,), both in m.
-
-    For the camera on the flange or standing before it, whichever fits better.
-    """
+    """How far each frame's board (n,) lies from where most put it, and from the camera (n,), both in m. For the camera
+    on the flange or standing before it, whichever fits better."""
     reach = np.array([np.linalg.norm(b.translation) for b in boards])
     both = (flanges, [f.inverse() for f in flanges])
     # The rotation is Park and Martin's, which wrong positions do not touch.
@@ -196,10 +188,8 @@ def board_shifts(
 
 
 def turn_votes(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> Array:
-    """Weights (n, n) of each two frames' vote on a rotation: views that do not turn agree with any, and have none.
-
-    By the smaller turn of flange and board: a picture that is the wrong way round must not outvote the others.
-    """
+    """Weights (n, n) of each two frames' vote on a rotation: views that do not turn agree with any, and have none. By
+    the smaller turn of flange and board: a picture that is the wrong way round must not outvote the others."""
     votes = np.sin(0.5 * np.minimum(turns_between(flanges), turns_between(boards))) ** 2
     np.fill_diagonal(votes, 0.0)
     return np.asarray(votes)

@@ -73,10 +73,8 @@ def _matrix(whole: Array) -> pin.SE3:
 
 
 def readings_of(count: int, named: str, wanted: str | None) -> list[PoseReading]:
-    """The readings of so many numbers, those that the names beside them allow, or the one that was asked for.
-
-    `named` is a record's: "quaternion" or "rotation" (position first), or empty.
-    """
+    """The readings of so many numbers, those that the names beside them allow, or the one that was asked for. `named`
+    is a record's: "quaternion" or "rotation" (position first), or empty."""
     if wanted is None and named == "quaternion":
         wanted = "xyz+quaternion-xyzw"
     return [r for r in map(PoseReading, TRIED if wanted is None else (wanted,)) if r.count == count]

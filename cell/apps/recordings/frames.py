@@ -280,10 +280,8 @@ def _find_places(frames: Sequence[RecordedFrame], links: Sequence[dict[str, str]
         first.setdefault(frame_key(frame.name), k)
 
     def order(frame: RecordedFrame) -> tuple[bool, bool, int, int, int]:
-        """The board's picture is not named after the laser, of the first number, with the shortest name.
-
-        Of a picture in two formats the larger file lost less.
-        """
+        """The board's picture is not named after the laser, of the first number, with the shortest name. Of a picture
+        in two formats the larger file lost less."""
         return frame.lit, frame.dark, first[frame_key(frame.name)], len(frame.name), -frame.path.stat().st_size
 
     places = []
@@ -333,10 +331,8 @@ def _joined_by_view(frames: Sequence[RecordedFrame]) -> Iterator[tuple[int, int]
 
 
 def _apart(a: BoardView, b: BoardView) -> float:
-    """Median distance in px of the same points of two views, in any order that the board allows.
-
-    Infinite for other sizes, and where few points are seen in both.
-    """
+    """Median distance in px of the same points of two views, in any order that the board allows. Infinite for other
+    sizes, and where few points are seen in both."""
     found = [_paired(a, turned) for turned in b.turns() if a.size == b.size]
     return min((float(np.median(off)) for off in found if off is not None), default=float("inf"))
 
@@ -422,10 +418,8 @@ def by_stop(frames: Sequence[RecordedFrame]) -> list[list[RecordedFrame]]:
 
 
 def merged(stop: Sequence[RecordedFrame]) -> RecordedFrame:
-    """One frame for a stop, named like its first: mean points and pose, the stripe that covers most rows.
-
-    The points' σ stays that of one picture: what is wrong with a corner at a place is wrong in every picture of it.
-    """
+    """One frame for a stop, named like its first: mean points and pose, the stripe that covers most rows. The points' σ
+    stays that of one picture: what is wrong with a corner at a place is wrong in every picture of it."""
     first = stop[0]
     if len(stop) == 1 or first.view is None:
         return first

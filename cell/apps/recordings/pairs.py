@@ -75,9 +75,7 @@ def _poses(path: Path, pairs: Array) -> list[Pair]:
 
 def calibrate_pairs(pairs: Sequence[Pair], wanted: str | None = None) -> RecordedResult:
     """Hand-eye from pairs, camera on the flange or standing before the board: as is `wanted`, or as the poses tell.
-
-    Pairs that do not agree with most are left out and named. Raises ConfigError when they give none.
-    """
+    Pairs that do not agree with most are left out and named. Raises ConfigError when they give none."""
     _check_unit(pairs)
     result = RecordedResult()
     stops = grouped(range(len(pairs)), lambda a, b: _one_stop(pairs[a], pairs[b]))

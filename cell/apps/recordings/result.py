@@ -52,10 +52,8 @@ class RecordedResult:
         return told | {"checks": [check.as_dict() for check in self.checks]}
 
     def apply(self, checks: Sequence[QualityCheck]) -> None:
-        """Keep the checks, say what is doubtful, and take out what is refused.
-
-        A light plane and a hand-eye rest on the camera: they are refused with it.
-        """
+        """Keep the checks, say what is doubtful, and take out what is refused. A light plane and a hand-eye rest on the
+        camera: they are refused with it."""
         self.checks = list(checks)
         self.notes += [f"doubtful: {check.text}" for check in checks if check.verdict == "doubt"]
         failed = {part: "; ".join(check.text for check in found) for part, found in refused_parts(checks).items()}
@@ -87,10 +85,8 @@ def camera_figures(camera: CameraModel, sigma: Array, rms_px: float, held_out: f
 def hand_eye_figures(
     setup: str, method: str, pose: pin.SE3, scatter: tuple[float, float], sigma: Array | None = None
 ) -> Figures:
-    """A hand-eye pose, its angles as matrix, rotation vector and XYZ Euler angles in rad.
-
-    `scatter` of the board in the base in m and rad; `sigma` (6,) in m and rad.
-    """
+    """A hand-eye pose, its angles as matrix, rotation vector and XYZ Euler angles in rad. `scatter` of the board in the
+    base in m and rad; `sigma` (6,) in m and rad."""
     first, middle, last = Rotation.from_matrix(pose.rotation).as_euler("XYZ").tolist()
     if first < 0:
         # Of the two triples for one rotation, that with the first angle in 0 … π.

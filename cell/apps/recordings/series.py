@@ -108,9 +108,7 @@ def _why_not(path: Path) -> str:
 @dataclass(eq=False)
 class Series:
     """Records of one kind, and in `of` the record of each picture by the picture's index; `by` says how they match.
-
-    `alone`: records of no picture. `doubled`: the records of a picture that has several.
-    """
+    `alone`: records of no picture. `doubled`: the records of a picture that has several."""
 
     name: str
     records: list[PoseRecord]
@@ -216,10 +214,8 @@ def _kinds(place: str, count: int, records: list[PoseRecord]) -> list[tuple[str,
 def match_series(
     series: Sequence[Series], listing: Listing, links: Sequence[dict[str, str]]
 ) -> tuple[list[Series], list[tuple[str, str]]]:
-    """The series that belong to pictures, and the names of the others with the reason.
-
-    Raises ConfigError for a folder with several recordings in it.
-    """
+    """The series that belong to pictures, and the names of the others with the reason. Raises ConfigError for a folder
+    with several recordings in it."""
     names = [listing.name(p) for p in listing.pictures]
     linked: dict[str, int] = {}
     for link in links:
@@ -240,10 +236,8 @@ def match_series(
 
 
 def _in_order(series: Sequence[Series], pictures: int) -> Iterator[Series]:
-    """Series by their order, of as many poses as pictures, whose numbers fit some of these only.
-
-    One may count from 0 and the other from 1: all but one fit, and each picture would get its neighbour's pose.
-    """
+    """Series by their order, of as many poses as pictures, whose numbers fit some of these only. One may count from 0
+    and the other from 1: all but one fit, and each picture would get its neighbour's pose."""
     for one in series:
         if one.by in ("name", "number") and len(one.records) == pictures > len(one.of):
             yield replace(one, by="order", of=dict(enumerate(one.records)), alone=[])
@@ -271,9 +265,7 @@ def _labels(one: Series, listing: Listing, single: bool) -> list[str]:
 
 def in_order_of_views(one: Series, frames: Sequence[RecordedFrame]) -> bool:
     """Give poses that name no picture to those that are left, in order, where there are as many; True where there are.
-
-    What is left are no copies, and none of another size: drawn or straightened pictures lie beside at times.
-    """
+    What is left are no copies, and none of another size: drawn or straightened pictures lie beside at times."""
     left = [k for k, f in enumerate(frames) if f.shows is None and f.reason not in ASIDE]
     if len(left) != len(one.records):
         return False
@@ -282,10 +274,8 @@ def in_order_of_views(one: Series, frames: Sequence[RecordedFrame]) -> bool:
 
 
 def _others(series: Sequence[Series], listing: Listing) -> list[Path]:
-    """Sub-folders that are recordings of their own, where the folder itself is one, too.
-
-    Raises ConfigError where it is none: their boards and bases need not be the same.
-    """
+    """Sub-folders that are recordings of their own, where the folder itself is one, too. Raises ConfigError where it is
+    none: their boards and bases need not be the same."""
     folders = [{listing.pictures[k].parent for k in one.of} for one in series if len(one.of) >= LEAST_ALONE]
     owners = {path for some in folders if len(some) == 1 for path in some}
     if len(owners) > 1 and listing.folder not in owners:

@@ -42,9 +42,7 @@ class CameraChanged(RefusedError):
 
 def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None) -> Cameras:
     """Camera of all used frames, and that without distortion; frames refused whose points miss by far more than others.
-
-    A `given` camera is taken as it is. Raises RefusedError where the frames give none.
-    """
+    A `given` camera is taken as it is. Raises RefusedError where the frames give none."""
     while True:
         kept = used(frames)
         try:

@@ -99,10 +99,8 @@ class ChosenChannel:
 
 
 def choose_channel(sources: Sequence[Source], laser: LaserChannel | None) -> ChosenChannel:
-    """What the laser is read in, in all pictures: as asked, or in what it stands out in most of those looked at.
-
-    Where none of them shows it there was no laser.
-    """
+    """What the laser is read in, in all pictures: as asked, or in what it stands out in most of those looked at. Where
+    none of them shows it there was no laser."""
     if laser is not LaserChannel.AUTO or not sources:
         return ChosenChannel(laser, laser)
     some = [sources[k] for k in np.unique(np.linspace(0, len(sources) - 1, LOOKED_AT).astype(int))]

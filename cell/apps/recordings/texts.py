@@ -73,10 +73,8 @@ class PoseRecord:
 
 @dataclass
 class Content:
-    """What a text holds: records, halves of them, and links between files (picture, or name of the other, file).
-
-    Halves are rotations (n, 9), (n, 4) or (n, 3), or positions (n, 3), with their place in the file.
-    """
+    """What a text holds: records, halves of them, and links between files (picture, or name of the other, file). Halves
+    are rotations (n, 9), (n, 4) or (n, 3), or positions (n, 3), with their place in the file."""
 
     path: Path
     records: list[PoseRecord] = field(default_factory=list)

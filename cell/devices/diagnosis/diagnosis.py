@@ -33,10 +33,8 @@ _FRAMES_MISSED = (
 
 
 def examine(kind: str, device: interfaces.Device, trips_s: Sequence[float], clock: Clock) -> list[interfaces.Reading]:
-    """Figures of a device of this kind whose round trips took `trips_s`, wall seconds. It is only looked at.
-
-    On a clock that is not the wall's, times have no limits: a simulated cell in a hurry is no measure.
-    """
+    """Figures of a device of this kind whose round trips took `trips_s`, wall seconds. It is only looked at. On a clock
+    that is not the wall's, times have no limits: a simulated cell in a hurry is no measure."""
     median, p99 = (1e3 * float(value) for value in np.percentile(trips_s, [50, 99]))
     judged = clock.rate <= 1.0
     found = [
@@ -120,10 +118,8 @@ class Diagnosis:
 def diagnose(
     path: Path | None, only: Collection[str] = (), *, sim: Sim, seed: int, level: str, speed: float
 ) -> list[Diagnosis]:
-    """Look at each device in turn, or at `only` those: nothing on them is set, started or ended.
-
-    Raises only for a wrong configuration, an unknown device, or devices that another process holds.
-    """
+    """Look at each device in turn, or at `only` those: nothing on them is set, started or ended. Raises only for a
+    wrong configuration, an unknown device, or devices that another process holds."""
     _require_known(only)
     names = simulated_of(sim, path)
     whole = set(names) == set(DEVICES)

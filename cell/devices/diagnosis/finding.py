@@ -229,10 +229,8 @@ NEXT = (
 
 
 def find(path: Path | None, ports: Collection[str] = (), *, ask: bool = False, root: Path = ROOT) -> list[Found]:
-    """What is there, then the configured devices, if there is a configuration.
-
-    `ports` are asked whether a TMCL module answers, with `ask` every serial port that was found and is free.
-    """
+    """What is there, then the configured devices, if there is a configuration. `ports` are asked whether a TMCL module
+    answers, with `ask` every serial port that was found and is free."""
     config: CellConfig | None = None
     unread: list[Found] = []
     try:
@@ -248,9 +246,7 @@ def find(path: Path | None, ports: Collection[str] = (), *, ask: bool = False, r
 
 def ask_module(port: str, config: CellConfig | None) -> Found:
     """Ask a serial port for a TMCL module's version, with the rail's configured speed and address, else the usual.
-
-    Where the configured rail is of another make, it is that one that is asked for.
-    """
+    Where the configured rail is of another make, it is that one that is asked for."""
     from drivers.rail.tmcl.link import TmclLink
 
     busy = _held(port) or ("" if "://" in port else barred(port) or opened_by(port))

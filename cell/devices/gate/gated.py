@@ -108,10 +108,8 @@ TIMEOUT_S = 1.0
 
 
 class GatedArm(Gated[interfaces.Arm]):
-    """The arm, its motions and its recovery begun through a gate.
-
-    `touch` adds what it would feel of a simulated station; None where the station is as real as the arm.
-    """
+    """The arm, its motions and its recovery begun through a gate. `touch` adds what it would feel of a simulated
+    station; None where the station is as real as the arm."""
 
     touch: SimulatedTouch | None = None
 
@@ -333,11 +331,8 @@ may take."""
 
 
 class GatedCamera(Gated[interfaces.Camera]):
-    """A camera whose commands are told at the gate.
-
-    `tries`: how often at most a picture is asked for. `longest_exposure`: what ambient light allows, s; a longer one
-    that is asked for is shortened to it.
-    """
+    """A camera whose commands are told at the gate. `tries`: how often at most a picture is asked for.
+    `longest_exposure`: what ambient light allows, s; a longer one that is asked for is shortened to it."""
 
     tries = 1
     longest_exposure = math.inf
@@ -430,10 +425,8 @@ class GatedLaser(Gated[interfaces.Laser]):
         return UNATTENDED_S * self._clock.rate
 
     def _check(self) -> float | None:
-        """Called by the alarm: off when the owner sleeps, else in how many seconds to look again.
-
-        One that cannot be switched off is switched off again and again, until its owner's context ends.
-        """
+        """Called by the alarm: off when the owner sleeps, else in how many seconds to look again. One that cannot be
+        switched off is switched off again and again, until its owner's context ends."""
         left = self._renewed + self._limit - self._clock.now()
         if left > 0:
             return left

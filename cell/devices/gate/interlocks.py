@@ -133,10 +133,8 @@ class Interlocks:
 
     @contextmanager
     def tried(self, output: int) -> Iterator[None]:
-        """Inside this context nobody knows what hangs on this output of the arm: it counts as a laser's.
-
-        An arm that can is told so as well: should this process be killed, the output still goes off.
-        """
+        """Inside this context nobody knows what hangs on this output of the arm: it counts as a laser's. An arm that
+        can is told so as well: should this process be killed, the output still goes off."""
         arm = self.situation.arm
         self._tried.append(output)
         try:

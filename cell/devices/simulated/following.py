@@ -76,9 +76,7 @@ class ArmFeed:
 
 class RailFeed:
     """Position: a sweep's readings as they come; at rest, where the last motion has brought it, for nothing else does.
-
-    It is not asked while it rests, nor while it moves without being recorded: that would take its line's time.
-    """
+    It is not asked while it rests, nor while it moves without being recorded: that would take its line's time."""
 
     def __init__(self, devices: Devices) -> None:
         self._rail, self._clock = devices.rail, devices.clock
@@ -198,10 +196,8 @@ class DeviceFollowing:
         return {**told, "clocks_known_ms": round(1e3 * self._clocks_known, 4)}
 
     def board_seen(self, base_from_board: pin.SE3) -> None:
-        """A real target camera has measured the station's board: the world's station is put there.
-
-        Nothing is done while the target camera, or the vehicle, is simulated: it sees that world's board already.
-        """
+        """A real target camera has measured the station's board: the world's station is put there. Nothing is done
+        while the target camera, or the vehicle, is simulated: it sees that world's board already."""
         if "target_camera" not in self.simulated and "vehicle" not in self.simulated:
             self._link.ask(op="board", base_from_board=base_from_board.homogeneous.tolist())
 

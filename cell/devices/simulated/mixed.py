@@ -33,9 +33,7 @@ NEEDS = {"scan_camera": ("arm", "rail", "vehicle", "laser", "target_camera"), "t
 
 def named(sim: Sim) -> tuple[str, ...] | None:
     """The devices that `sim` asks to simulate, in the cell's order; None where it leaves that to the configuration.
-
-    Raises `ConfigError` for a name that is none.
-    """
+    Raises `ConfigError` for a name that is none."""
     if sim is None:
         return None
     names = [word.strip() for word in sim.split(",") if word.strip()] if isinstance(sim, str) else list(sim)
@@ -184,10 +182,8 @@ class MixedCell:
         self, undo: ExitStack, config: CellConfig, job: str | Path, seed: int, level: str, simulated: tuple[str, ...],
         needed: Collection[str],
     ) -> None:  # fmt: skip
-        """Simulate these of the `needed` devices and connect the others; what is to be undone goes to `undo`.
-
-        Raises `ConfigError` for a mix that physics does not allow, else as `connect` and `DeviceFollowing`.
-        """
+        """Simulate these of the `needed` devices and connect the others; what is to be undone goes to `undo`. Raises
+        `ConfigError` for a mix that physics does not allow, else as `connect` and `DeviceFollowing`."""
         from cell.devices.simulated.described import Described
 
         require_possible(config, simulated, needed)

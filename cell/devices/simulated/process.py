@@ -174,9 +174,7 @@ class Simulation(Protocol):
 
     def make_ready(self, described: Described) -> None:
         """As a person does: set up the job's station, with its part in the claw; nothing where that is so already.
-
-        `ConfigError` for a job that cannot be simulated as it is described.
-        """
+        `ConfigError` for a job that cannot be simulated as it is described."""
 
     def close(self) -> None:
         """End its world."""
@@ -317,10 +315,8 @@ def on_gige(config: CellConfig) -> list[str]:
 def with_endpoints(
     config: CellConfig, endpoints: dict[str, Any], simulated: Collection[str] = tuple(DEVICES)
 ) -> CellConfig:
-    """The configuration with the addresses of these devices replaced by those of their simulated peers.
-
-    Raises `ConfigError` when one of them is of a make that has none.
-    """
+    """The configuration with the addresses of these devices replaced by those of their simulated peers. Raises
+    `ConfigError` when one of them is of a make that has none."""
     changed: dict[str, Any] = {}
     if set(simulated) == set(DEVICES):
         section = {"time_scale": float(endpoints["speed"]), "truth": endpoints["truth"]["address"]}
@@ -360,10 +356,8 @@ class Injection:
 
     @classmethod
     def parse(cls, text: str, steps: Sequence[str]) -> Injection:
-        """From `fault@step:percent%`, or `fault@step` for its start; `ConfigError` lists what is known.
-
-        `steps` are the names of the job's steps.
-        """
+        """From `fault@step:percent%`, or `fault@step` for its start; `ConfigError` lists what is known. `steps` are the
+        names of the job's steps."""
         match = _FORM.fullmatch(text.strip())
         if match is None:
             raise ConfigError(
@@ -384,10 +378,8 @@ class Injection:
 
 
 class Injector:
-    """An observer of a run that causes each fault once, by `cause(name)`.
-
-    `missed` has what was scheduled and did not happen: not reached, or not to be caused, and why.
-    """
+    """An observer of a run that causes each fault once, by `cause(name)`. `missed` has what was scheduled and did not
+    happen: not reached, or not to be caused, and why."""
 
     def __init__(self, cause: Callable[[str], None], injections: Sequence[Injection]) -> None:
         self.injections = tuple(injections)

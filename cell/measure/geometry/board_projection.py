@@ -32,10 +32,8 @@ def distorted(lens: Array, x: float, y: float) -> tuple[float, float, float, flo
 
 @compiled
 def undistort(lens: Array, distant: Array, ideal: Array, off: Array, determinant: Array) -> None:  # pragma: no cover
-    """Newton's method on `distorted`: writes the `ideal` coordinates (n, 2) of distorted ones (n, 2).
-
-    And by how much each is `off` (n,) still, and the `determinant` (n,) of the last step: not positive past a fold.
-    """
+    """Newton's method on `distorted`: writes the `ideal` coordinates (n, 2) of distorted ones (n, 2). And by how much
+    each is `off` (n,) still, and the `determinant` (n,) of the last step: not positive past a fold."""
     for i in range(len(distant)):
         x, y = distant[i, 0], distant[i, 1]
         determinant[i] = 1.0
@@ -118,10 +116,8 @@ def pose_equations(
     lens: Array, rotation: Array, translation: Array, points: Array, factor: Array, residual: Array, normal: Array,
     right: Array,
 ) -> None:  # pragma: no cover  # fmt: skip
-    """Writes the normal matrix (6, 6) and the right side (6,) for a small move of a board's pose in the camera.
-
-    From `residual` (n, 2) in px, each point's weighted by `factor` (n,) squared. The move is (δt, δφ) in camera axes.
-    """
+    """Writes the normal matrix (6, 6) and the right side (6,) for a small move of a board's pose in the camera. From
+    `residual` (n, 2) in px, each point's weighted by `factor` (n,) squared. The move is (δt, δφ) in camera axes."""
     normal[:] = 0.0
     right[:] = 0.0
     row = np.zeros(6)

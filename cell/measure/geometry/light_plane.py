@@ -88,10 +88,8 @@ class LightPlane:
         return away - self.bow * self.shape(points) if self.bow else away
 
     def intersect(self, rays: ArrayLike) -> Array:
-        """Points (n, 3) in m where unit rays (n, 3) meet the sheet: P = d u/(n·u), less the bow's share of n·u.
-
-        A ray near the plane's vanishing line, or one that would meet it behind the camera, gives NaN.
-        """
+        """Points (n, 3) in m where unit rays (n, 3) meet the sheet: P = d u/(n·u), less the bow's share of n·u. A ray
+        near the plane's vanishing line, or one that would meet it behind the camera, gives NaN."""
         u = np.atleast_2d(np.asarray(rays, dtype=np.float64))
         return np.asarray(u * self._range(u)[:, None], dtype=np.float64)
 
@@ -126,10 +124,8 @@ class LightPlane:
 
 
 def triangulate(camera: CameraModel, plane: LightPlane, pixels: ArrayLike) -> tuple[Array, Array]:
-    """Points (n, 3) in m in the camera frame of stripe pixels (n, 2), and ∂P/∂pixel (n, 3, 2) in m/px.
-
-    NaN where a pixel's ray does not meet the plane in front of the camera.
-    """
+    """Points (n, 3) in m in the camera frame of stripe pixels (n, 2), and ∂P/∂pixel (n, 3, 2) in m/px. NaN where a
+    pixel's ray does not meet the plane in front of the camera."""
     rays, ray_by_pixel = camera.rays_with_jacobian(pixels)
     points, by_ray, _, _ = plane.intersect_with_jacobians(rays)
     return points, np.asarray(by_ray @ ray_by_pixel, dtype=np.float64)

@@ -34,10 +34,8 @@ ROUNDING = 1e-14
 
 
 def from_matrix(matrix: ArrayLike) -> pin.SE3:
-    """Pose of a homogeneous 4×4 matrix; the rotation is brought back to the nearest true rotation.
-
-    One that is true as far as doubles go stays as it is: a pose that was kept comes back to the last bit.
-    """
+    """Pose of a homogeneous 4×4 matrix; the rotation is brought back to the nearest true rotation. One that is true as
+    far as doubles go stays as it is: a pose that was kept comes back to the last bit."""
     m = np.asarray(matrix, dtype=np.float64)
     if m.shape != (4, 4) or not np.allclose(m[3], (0, 0, 0, 1), atol=1e-6):
         raise ValueError(f"a pose must be a 4×4 matrix with last row 0 0 0 1, not of shape {m.shape}: {m.tolist()}")

@@ -124,10 +124,8 @@ def _squares(scan: Scan, pose: pin.SE3, nominal: NominalSurface) -> Array:
 
 
 def require_board(shared: Array, prior: Prior, correction: Array) -> None:
-    """Refuse a pose that contradicts the board, by the squared Mahalanobis distance between the two.
-
-    A direction that the scan does not determine stays where the board put it and adds nothing.
-    """
+    """Refuse a pose that contradicts the board, by the squared Mahalanobis distance between the two. A direction that
+    the scan does not determine stays where the board put it and adds nothing."""
     distance = float(correction @ np.linalg.solve(prior.covariance + shared, correction))
     if not distance <= BOARD_DISAGREES:
         raise RefusedError(

@@ -111,9 +111,7 @@ def _beyond_noise(motion: Array, spread: Array, tolerance: Tolerance) -> float:
 
 def _ways(pose: pin.SE3, nominal: NominalSurface, tolerance: Tolerance) -> Array:
     """Motions (6, 3) of the surface by one tolerance each: along its mean normal, and two tilts about its middle.
-
-    Sliding and turning across the surface are left out: a quarter alone often does not determine them.
-    """
+    Sliding and turning across the surface are left out: a quarter alone often does not determine them."""
     normal, sides = across(nominal)
     turn, middle = pose.rotation, pose.rotation @ nominal.centre
     ways = np.zeros((6, 3))
@@ -168,9 +166,7 @@ ALLOWED = 0.5
 @dataclass(frozen=True, eq=False)
 class Standing:
     """The highest square: it would lift a part by `height`, m, at least; its middle at `at` (3,), m, surface frame.
-
-    `seen` is the share of the surface below the part, as drawn, with a square that has points enough.
-    """
+    `seen` is the share of the surface below the part, as drawn, with a square that has points enough."""
 
     height: float
     at: Array
@@ -211,10 +207,8 @@ def highest_standing(
 
 
 def square_of(places: Array, shift: tuple[int, ...] = (0, 0)) -> Indices:
-    """The number (n,) of the square of 2 mm, across x and y, in which each place (n, 3), m, lies.
-
-    The squares may be shifted by half a one.
-    """
+    """The number (n,) of the square of 2 mm, across x and y, in which each place (n, 3), m, lies. The squares may be
+    shifted by half a one."""
     column, row = np.floor(places[:, :2] / SQUARE_M + 0.5 * np.array(shift)).astype(np.intp).T
     return np.asarray(column * 2 * ROWS + row)
 

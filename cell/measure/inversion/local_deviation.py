@@ -58,10 +58,8 @@ class Span(NamedTuple):
 
 
 class Rim(NamedTuple):
-    """A part ends by `farther` along `outward` (3,) than drawn, square to its edge and to the surface's z axis.
-
-    A rim that may be hidden is never told to end too soon.
-    """
+    """A part ends by `farther` along `outward` (3,) than drawn, square to its edge and to the surface's z axis. A rim
+    that may be hidden is never told to end too soon."""
 
     farther: Span
     outward: Array
@@ -86,10 +84,8 @@ class LocalDeviation:
 
 
 def higher_about(seen: PointHeights, at: Array, rocks: float = 0.0) -> Span | None:
-    """How much higher than drawn the points `seen` stand about `at` (3,) m, surface frame; None where too few show.
-
-    The vehicle `rocks` by so much, m, up and down: the points about a feature are swept together, at one end of that.
-    """
+    """How much higher than drawn the points `seen` stand about `at` (3,) m, surface frame; None where too few show. The
+    vehicle `rocks` by so much, m, up and down: the points about a feature are swept together, at one end of that."""
     drawn = seen.places - np.outer(seen.higher, [0.0, 0.0, 1.0])
     near = np.linalg.norm(drawn - at, axis=1) < NEAR_M
     if not near.any():

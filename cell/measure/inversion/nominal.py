@@ -36,9 +36,7 @@ MARGIN = 0.004
 
 class Grid:
     """Cells around a mesh: `owner` (i, j, k) a triangle near each, `distance` (i, j, k) m of its middle from the mesh.
-
-    `low` (3,) is the corner of the first cell and `cell` the edge, m.
-    """
+    `low` (3,) is the corner of the first cell and `cell` the edge, m."""
 
     def __init__(self, samples: Array, owners: Indices) -> None:
         low, high = samples.min(axis=0) - MARGIN, samples.max(axis=0) + MARGIN
@@ -232,10 +230,8 @@ class NominalSurface:
 
     @classmethod
     def load(cls, path: Path, unit: Literal["m", "mm"] = "m", rim: float = 0.0006) -> "NominalSurface":
-        """Read an STL or PLY (or another format that trimesh knows); `ConfigError` when it is no usable mesh.
-
-        The last few are kept: one job after another is placed on the same surface, and preparing it takes a while.
-        """
+        """Read an STL or PLY (or another format that trimesh knows); `ConfigError` when it is no usable mesh. The last
+        few are kept: one job after another is placed on the same surface, and preparing it takes a while."""
         return _prepared(path, _MeshFile.of(path), unit, rim)
 
     @property

@@ -124,11 +124,8 @@ class SmallMotion:
 
 @dataclass(frozen=True, eq=False)
 class PoseVerdict:
-    """What is known of the pose.
-
-    worst: the least certain motion, in units of the tolerance. weak: the motions beyond tolerance, worst first.
-    unseen: motions that the scan alone does not determine, so that the board decides them.
-    """
+    """What is known of the pose. worst: the least certain motion, in units of the tolerance. weak: the motions beyond
+    tolerance, worst first. unseen: motions that the scan alone does not determine, so that the board decides them."""
 
     worst: SmallMotion
     weak: tuple[SmallMotion, ...]

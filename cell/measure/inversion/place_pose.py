@@ -141,10 +141,8 @@ FAR = 3.5
 
 
 def shared_by_patches(found: Registration, least: float = SIGMA_FLOOR) -> tuple[float, Array]:
-    """One standard deviation, m, of what a patch's points share, and the pose's covariance (6, 6) because of it.
-
-    It is `least`, m, where the patches show no more than that.
-    """
+    """One standard deviation, m, of what a patch's points share, and the pose's covariance (6, 6) because of it. It is
+    `least`, m, where the patches show no more than that."""
     patch, count = _patches(found)
     weights = 1.0 / found.sigmas**2
     total = np.bincount(patch, weights)
@@ -165,9 +163,7 @@ def _beyond_noise(means: Array, by_noise: Array, least: float) -> float:
 
 def _patches(found: Registration) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """The patch of each accepted point, and how many points each has: a square across the way that the surface faces.
-
-    Not by how high the points lie: a border along the surface would part them by the sign of their noise.
-    """
+    Not by how high the points lie: a border along the surface would part them by the sign of their noise."""
     turn = found.base_from_surface.rotation
     square = np.floor(found.arms @ turn / PATCH_M).astype(np.intp)
     normals = found.normals @ turn
@@ -327,9 +323,7 @@ class _Inversion:
 
     def settled(self, found: Registration, shared: Array) -> tuple[pin.SE3, Array, PoseVerdict]:
         """The pose, gone back to the board's where too few points tell a motion; its own covariance; and its verdict.
-
-        `shared` (6, 6) is the covariance of what all points share, base axes.
-        """
+        `shared` (6, 6) is the covariance of what all points share, base axes."""
         pose, nominal, prior = found.base_from_surface, self.nominal, self.prior
         turn = np.kron(np.eye(2), pose.rotation.T)
         ways: Array = np.concatenate([found.normals, np.cross(found.arms, found.normals)], axis=1) @ turn.T

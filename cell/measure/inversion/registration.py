@@ -172,10 +172,8 @@ class Registration:
 
 
 def register(scan: Scan, nominal: NominalSurface, prior: Prior) -> Registration:
-    """Find base_from_surface from the prior's pose on, in the light of scan and prior.
-
-    Raises `RefusedError` when too few points lie over the surface.
-    """
+    """Find base_from_surface from the prior's pose on, in the light of scan and prior. Raises `RefusedError` when too
+    few points lie over the surface."""
     begin = prior.base_from_surface
     pose, fit = _search(begin, scan, nominal, prior, begin)
     for other in _beside(begin, nominal, prior):

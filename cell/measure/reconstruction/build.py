@@ -22,11 +22,8 @@ from cell.measure.vision.stripe.profile import StripeProfile
 
 @dataclass(frozen=True)
 class ScanGeometry:
-    """What triangulation needs to know of the scan head.
-
-    `rail_direction` (3,): metres that the camera moves, in camera axes, per metre of rail reading (direction times
-    scale). `flange_from_camera` holds at rail position 0.
-    """
+    """What triangulation needs to know of the scan head. `rail_direction` (3,): metres that the camera moves, in camera
+    axes, per metre of rail reading (direction times scale). `flange_from_camera` holds at rail position 0."""
 
     camera: CameraModel
     light_plane: LightPlane
@@ -60,10 +57,8 @@ class ProfileBuilder:
         return self._lines
 
     def see(self, profile: StripeProfile) -> int:
-        """Triangulate a profile in the camera's frame, as the next line; the number of its points.
-
-        `ValueError` when the profile is not one centre per row of this camera.
-        """
+        """Triangulate a profile in the camera's frame, as the next line; the number of its points. `ValueError` when
+        the profile is not one centre per row of this camera."""
         if profile.axis != "rows" or len(profile.centres) != self._rows:
             raise ValueError(
                 f"a profile of {len(profile.centres)} {profile.axis} does not fit a camera of {self._rows} rows"

@@ -36,9 +36,7 @@ MOST_PAIRS = 12
 
 def find_outliers(depth: NDArray[np.floating], sigma: NDArray[np.floating]) -> NDArray[np.bool_]:
     """True (lines, rows) for outliers of `depth` (lines, rows) in m, NaN for holes; `sigma` is its noise in m.
-
-    Deviations are weighed by `sigma`. What a first pass finds is left out of the medians of a second one.
-    """
+    Deviations are weighed by `sigma`. What a first pass finds is left out of the medians of a second one."""
     values = np.array(depth, dtype=np.float64)
     noise = np.array(sigma, dtype=np.float64)
     measured = np.isfinite(values)
@@ -70,10 +68,8 @@ def _pass(values: Array, kept: Array, noise: Array, level: float, settled: Mask)
 
 
 def _level(values: Array, noise: Array) -> float:
-    """Median absolute deviation over the whole cloud, in units of the noise, from every few lines and rows.
-
-    At least `LEAST_LEVEL`: nothing is an outlier that lies within the noise that was stated for it.
-    """
+    """Median absolute deviation over the whole cloud, in units of the noise, from every few lines and rows. At least
+    `LEAST_LEVEL`: nothing is an outlier that lies within the noise that was stated for it."""
     deviations = _sampled(values, noise, 3 if values.size < 20_000 else 7)
     found = deviations[np.isfinite(deviations)]
     return max(LEAST_LEVEL, float(np.median(np.abs(found)))) if len(found) else 1.0

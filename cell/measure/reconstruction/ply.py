@@ -188,9 +188,7 @@ def _of_sweep(points: Array, line: Indices, row: Indices, mine: Indices) -> Indi
 
 def write_mesh(path: Path, points: Array, faces: Indices, colours: NDArray[np.uint8] | None = None) -> int:
     """Write the mesh in metres as PLY, or as binary STL (without colours) when `path` ends so; its triangles' number.
-
-    Vertices that no triangle uses are left out.
-    """
+    Vertices that no triangle uses are left out."""
     import trimesh
 
     used, numbers = np.unique(faces, return_inverse=True)

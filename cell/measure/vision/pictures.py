@@ -137,9 +137,7 @@ def _is_cut(data: bytes) -> bool:
 
 def _jpeg_scan(data: bytes) -> int:
     """Where the picture itself begins in a JPEG: behind its headers, whose preview has an end mark of its own.
-
-    Telephones write further data behind the picture, so the end mark need not be near the file's end.
-    """
+    Telephones write further data behind the picture, so the end mark need not be near the file's end."""
     at = 2
     while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")

@@ -125,10 +125,8 @@ class Mover:
     def avoid_station(
         self, base_from_place: pin.SE3, job: Job, board: BoardSpec, surface_extent: tuple[Vector, Vector]
     ) -> None:
-        """From now on avoid the station as well, where it was measured.
-
-        `surface_extent` are the lowest and the highest corner (3,) of the nominal surface in its own frame, m.
-        """
+        """From now on avoid the station as well, where it was measured. `surface_extent` are the lowest and the highest
+        corner (3,) of the nominal surface in its own frame, m."""
         centre = job.place_from_board * from_parts(centre_of(board))
         on_place = job.surface.place_from_surface.se3()
         low, (x, y, z) = (corner.tolist() for corner in surface_extent)
@@ -228,10 +226,8 @@ class Mover:
             self.line(from_parts((0.0, 0.0, RISE_M)) * from_ur(self._arm.state().flange), RISE_SPEED, TOUCHES)
 
     def to_view(self, base_from_flange: pin.SE3) -> None:
-        """Move freely to a view of a calibration with the calibration's joints, those nearest to HOME.
-
-        Raises `Unreachable`, or `CollisionError` where these joints are not free.
-        """
+        """Move freely to a view of a calibration with the calibration's joints, those nearest to HOME. Raises
+        `Unreachable`, or `CollisionError` where these joints are not free."""
         self.to_joints(self.kinematics.unwound(self.kinematics.ik(base_from_flange, HOME), self.joints))
 
     def rest_at(self, base_from_flange: pin.SE3) -> None:
@@ -252,10 +248,8 @@ class Mover:
         self, base_from_flange: pin.SE3, speed: float, allowed: Sequence[Pair] = (), *,
         force_limit: float | None = None, settle: bool = True, near: float = 0.0, leaving: bool = False,
     ) -> bool:  # fmt: skip
-        """Move the flange in a straight line; True when it ended early in contact, at `force_limit` N.
-
-        With `near`, m, only so much of its end, or of its beginning when `leaving`, goes at `speed`; the rest faster.
-        """
+        """Move the flange in a straight line; True when it ended early in contact, at `force_limit` N. With `near`, m,
+        only so much of its end, or of its beginning when `leaving`, goes at `speed`; the rest faster."""
         far = min(max(speed, FAR_SPEED) if near else speed, self._tool_speed)
         acceleration = max(0.02, min(3.0 * far, np.inf if force_limit is None else force_limit / HEAVY_KG))
         slow, jerk = min(speed, far), 8.0
@@ -290,10 +284,8 @@ class Mover:
 
 
 def moved_once_more(arm: Arm, move: Callable[[], None]) -> None:
-    """Do `move`; once more after a fault of the arm that a program may clear by itself, such as a lost program.
-
-    After a protective stop this is refused: a person has to look first.
-    """
+    """Do `move`; once more after a fault of the arm that a program may clear by itself, such as a lost program. After a
+    protective stop this is refused: a person has to look first."""
     try:
         move()
     except DeviceFault as fault:
@@ -326,9 +318,7 @@ class PartState(Enum):
 @dataclass(eq=False)
 class PartProgress:
     """What has become of the part, kept beside the step: a run may be ended by others while the part is on its way.
-
-    `where` is base_from_part of a part that lies, None while it is held; `left` tells whether the arm has gone up.
-    """
+    `where` is base_from_part of a part that lies, None while it is held; `left` tells whether the arm has gone up."""
 
     state: PartState = PartState.HELD
     where: pin.SE3 | None = None

@@ -134,10 +134,8 @@ LEAST_M = 20e-6
 
 
 def swing(views: Sequence[BoardView], metres_per_px: float) -> float:
-    """By how much, m, to either side the board moves between photographs from one place; 0 where nothing shows it.
-
-    The mean place of the points that all of them show tells it: what lens and board are off by is the same in each.
-    """
+    """By how much, m, to either side the board moves between photographs from one place; 0 where nothing shows it. The
+    mean place of the points that all of them show tells it: what lens and board are off by is the same in each."""
     if len(views) < 2:
         return 0.0
     shared = reduce(np.intersect1d, [view.ids for view in views])
@@ -159,9 +157,7 @@ def swing(views: Sequence[BoardView], metres_per_px: float) -> float:
 
 def swing_covariance(swung: float, base_from_board: pin.SE3, base_from_vehicle: pin.SE3) -> Vector:
     """Covariance (6, 6), m² and rad², base axes, of a board that goes to and fro by `swung` m as the vehicle rocks.
-
-    Raises `RefusedError` when it rocks too much to put anything down.
-    """
+    Raises `RefusedError` when it rocks too much to put anything down."""
     angle = roll_of(swung, base_from_board, base_from_vehicle)
     require_firm(angle, swung, "the board")
     return np.diag([0.5 * swung**2] * 3 + [0.5 * angle**2] * 3)
@@ -186,9 +182,7 @@ def _require(pose: BoardPose, limits: PhotoSection) -> None:
 @dataclass(frozen=True)
 class ScanPlan:
     """A planned sweep: where the flange begins and ends, in the base, and the rail positions at these two places.
-
-    Between them the velocity is constant. Either the flange stands still, or the rail.
-    """
+    Between them the velocity is constant. Either the flange stands still, or the rail."""
 
     base_from_flange: pin.SE3
     base_from_flange_end: pin.SE3
@@ -350,9 +344,7 @@ def rail_ends(
     travel: tuple[float, float],
 ) -> tuple[float, float]:  # fmt: skip
     """The rail positions farthest either way of a view at which the picture shows the rings and half of the dots.
-
-    Raises `RefusedError` when they are less than `LEAST_WAY` apart.
-    """
+    Raises `RefusedError` when they are less than `LEAST_WAY` apart."""
     points, radius = board.points(), board.dot_radius
     rings = [row * board.cols + column for column, row in board.rings]
     size = np.array([scan.camera.width, scan.camera.height])

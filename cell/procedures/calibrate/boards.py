@@ -179,10 +179,8 @@ def _rail_moves(
 def collect_target(
     config: CellConfig, devices: Devices, mover: Mover, check: Check, progress: Progress, keep: Keep
 ) -> list[TargetObservation]:
-    """Dots of the large board, at several distances and tilts; every picture goes to `keep`.
-
-    Raises `RefusedError` when too few views show it.
-    """
+    """Dots of the large board, at several distances and tilts; every picture goes to `keep`. Raises `RefusedError` when
+    too few views show it."""
     board = parse_board(config.calibration.large.board)
     views = target_calibration_views(config, board)
     devices.target_camera.configure(config.target_camera.photo_exposure, PHOTO_RATE)

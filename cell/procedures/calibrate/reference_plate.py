@@ -179,9 +179,7 @@ def look_at_edge(
     config: CellConfig, devices: Devices, keep: Keep, witness: PlateLine, near: float | None
 ) -> Edge | None:
     """The plate's edge by the rail, m, as both ways over it show it; it is searched where no place `near` is given.
-
-    None where the plate shows no edge there: it may be larger than the camera sees, or covered.
-    """
+    None where the plate shows no edge there: it may be larger than the camera sees, or covered."""
     low, high = config.rail.travel
     room = SEARCH_SPEED**2 / (2 * config.rail.acceleration) + ROOM_M
     low, high = low + room, high - room

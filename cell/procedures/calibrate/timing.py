@@ -42,10 +42,8 @@ def collect_timing(
     config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration, check: Check,
     progress: Progress, keep: Keep,
 ) -> timing.StampTiming:  # fmt: skip
-    """Sweep over the fine board to and fro, fast and slowly, and say how late the stamps are.
-
-    Raises what `find_timing` raises, and `RefusedError` when the board is not seen.
-    """
+    """Sweep over the fine board to and fro, fast and slowly, and say how late the stamps are. Raises what `find_timing`
+    raises, and `RefusedError` when the board is not seen."""
     short, long = (share * config.scan_camera.photo_exposure for share in EXPOSURES)
     fast = min(config.rail.max_speed, MOST_SMEAR_M / long)
     slow = SLOW_SHARE * fast
@@ -92,10 +90,8 @@ def _sweeps(
     config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration,
     pairs: Sequence[tuple[float, float]], notify: Callable[[int, int], None], keep: Keep,
 ) -> tuple[pin.SE3, list[timing.TimedSweep]]:  # fmt: skip
-    """Where the flange stood, and sweeps to and fro for each of `pairs` of speed in m/s and exposure in s.
-
-    `notify` is given each sweep's number and how many there are.
-    """
+    """Where the flange stood, and sweeps to and fro for each of `pairs` of speed in m/s and exposure in s. `notify` is
+    given each sweep's number and how many there are."""
     fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
     view, _ = verification_views(config, fine, large, calibration.scan, calibration.target)
     base_from_board = references(calibration.scan, calibration.target)[0].base_from_board

@@ -89,11 +89,8 @@ class CheckObservations:
 
 
 def verify(scan: ScanCalibration, target: TargetCalibration, seen: CheckObservations) -> DriftVerdict:
-    """Compare with what the calibration predicts.
-
-    Raises `CalibrationStale` for a calibration that was stored without its reference, `RefusedError` when the sweep
-    does not show the board.
-    """
+    """Compare with what the calibration predicts. Raises `CalibrationStale` for a calibration that was stored without
+    its reference, `RefusedError` when the sweep does not show the board."""
     near, far = references(scan, target)
     head, eye = scan.state(near.base_from_board), target.state(far.base_from_board)
     evidences = {
@@ -176,10 +173,8 @@ def collect_verification(
     config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration, check: Check,
     progress: Progress, keep: Keep,
 ) -> CheckObservations:  # fmt: skip
-    """Take all pictures; each goes to `keep`.
-
-    Raises `RefusedError` when a board or the laser's witness is not seen, `CalibrationStale` without a reference.
-    """
+    """Take all pictures; each goes to `keep`. Raises `RefusedError` when a board or the laser's witness is not seen,
+    `CalibrationStale` without a reference."""
     fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
     scan_view, target_view = verification_views(config, fine, large, calibration.scan, calibration.target)
     near, _ = references(calibration.scan, calibration.target)
@@ -453,10 +448,8 @@ class Verification:
 
 
 def at_place(calibration: CellCalibration, job: Job, middle: float = 0.0) -> Callable[[str, Array], float]:
-    """What a change (27,) of the "scan" or the "target" chain does at the place of a job, m.
-
-    `middle` is where the rail stands in the middle of a sweep, for a change that turns the rail as well.
-    """
+    """What a change (27,) of the "scan" or the "target" chain does at the place of a job, m. `middle` is where the rail
+    stands in the middle of a sweep, for a change that turns the rail as well."""
     board = parse_board(job.board.spec)
     camera_from_board = from_parts((0.0, 0.0, job.photo.stand_off)) * from_parts(-centre_of(board))
     place = (camera_from_board * job.place_from_board.inverse()).translation

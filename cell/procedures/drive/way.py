@@ -129,9 +129,7 @@ class Whereabouts:
 
     def count(self) -> None:
         """Count what it has gone since the last look; for those who drive it by other means than `pose`, all the time.
-
-        A way there and back is none between two looks.
-        """
+        A way there and back is none between two looks."""
         self._count(self._vehicle.state())
 
     def _count(self, state: VehicleState) -> Planar:

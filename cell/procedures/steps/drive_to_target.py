@@ -239,10 +239,8 @@ class TargetDrive:
 def stand_at_target(
     job: Job, vehicle_from_base: pin.SE3, vehicle: Vehicle, whereabouts: Whereabouts, photograph: Callable[[], BoardFix]
 ) -> VehicleArrival:
-    """What `TargetDrive` is for an arm on a fixed frame: look whether the station stands where the job has it.
-
-    Raises `RefusedError` with how far it is off when that is more than the job's tolerance.
-    """
+    """What `TargetDrive` is for an arm on a fixed frame: look whether the station stands where the job has it. Raises
+    `RefusedError` with how far it is off when that is more than the job's tolerance."""
     try:
         fix = photograph()
     except RefusedError as unseen:

@@ -110,10 +110,8 @@ def in_few_lines(
     workplace: Workplace, over: pin.SE3, head: ScanCalibration, before: Swath, *, keep: str, check: Callable[[], None],
     progress: Callable[[float, str], None], back: bool = False, counted: bool = False,
 ) -> SweepRecord:  # fmt: skip
-    """Sweep the job's last strip, swept `before`, once more in about `LINES` lines, the other way if `back`.
-
-    `over` is base_from_surface, `keep` what its frames are kept as. Raises what `laser_sweep` raises.
-    """
+    """Sweep the job's last strip, swept `before`, once more in about `LINES` lines, the other way if `back`. `over` is
+    base_from_surface, `keep` what its frames are kept as. Raises what `laser_sweep` raises."""
     scan = workplace.job.scan
     few = sparse(workplace, scan.swath[-1], before)
     # A camera of a few frame rates takes all the lines.
@@ -145,10 +143,8 @@ def pace(swath: Swath) -> float:
 
 
 def slowed_down(scan: ScanSection, attempt: int) -> ScanSection:
-    """The sweep of the `attempt` (from 1): each repetition half as fast with half the frames, the lines as close.
-
-    What loses frames most often is a machine that does not keep up with them.
-    """
+    """The sweep of the `attempt` (from 1): each repetition half as fast with half the frames, the lines as close. What
+    loses frames most often is a machine that does not keep up with them."""
     seconds = len(scan.swath) * scan.length / scan.speed
     # No slower than the step has time for.
     share = max(0.5 ** (attempt - 1), min(1.0, seconds / LONGEST_SWEEP_S))

@@ -342,10 +342,8 @@ class AimedPlace:
     def fitted(
         self, workplace: Workplace, pose: PlacePose, context: StepContext
     ) -> "tuple[AimedPlace, MatingGap | None]":
-        """This, and the gap where the part touches first; straight at the place where it would not fit aside.
-
-        Raises `RefusedError` where it does not fit at its place.
-        """
+        """This, and the gap where the part touches first; straight at the place where it would not fit aside. Raises
+        `RefusedError` where it does not fit at its place."""
         try:
             gaps = [_mated(workplace, pose, lies, context) for lies in self.touching]
         except RefusedError as refused:
@@ -362,10 +360,7 @@ class AimedPlace:
 
 def _mated(workplace: Workplace, pose: PlacePose, lies: pin.SE3, context: StepContext) -> MatingGap | None:
     """The gap between the part as drawn, where it `lies` on the surface, and that as scanned; None without a mesh of
-    the part or a scan.
-
-    Raises `RefusedError` where they do not fit.
-    """
+    the part or a scan. Raises `RefusedError` where they do not fit."""
     if workplace.part_mesh is None:
         return None
     context.progress(0.0, "holding the part's underside against the surface")
@@ -385,10 +380,8 @@ def _mated(workplace: Workplace, pose: PlacePose, lies: pin.SE3, context: StepCo
 def carried_on(
     workplace: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: BoardFix, creep: Creep
 ) -> PlacePose:
-    """The place when the part touches it, of a surface that creeps, from the sweep freed of that.
-
-    Raises what `inverted` raises, and `NotObservable` where too little is known of the rate.
-    """
+    """The place when the part touches it, of a surface that creeps, from the sweep freed of that. Raises what
+    `inverted` raises, and `NotObservable` where too little is known of the rate."""
     crept = together(scan.by_poses, lambda lines, rows: creep.motions(scan.cloud, lines, rows, sweep.times))
     still = replace(scan, cloud=creep.undone(scan.cloud, sweep.times), by_poses=crept)
     plan = workplace.job.place

@@ -55,9 +55,7 @@ def _run_step(workplace: Workplace, context: StepContext) -> PlacedPart:
 
 def part_in_base(workplace: Workplace, job: Job, faces: NominalSurface, swept: tuple[Cloud, SweepRecord]) -> PlacePose:
     """Where the part with these `faces` lies in the arm base, by the sweep of its nest, which is the place of `job`.
-
-    Raises `RefusedError` where it is not seen there.
-    """
+    Raises `RefusedError` where it is not seen there."""
     (cloud, record), belongs = swept, job.place.surface_from_part.se3()
     by_calibration, by_poses = displacements(workplace, record, cloud)
     on_part, _ = parted(cloud, faces, belongs)

@@ -188,10 +188,8 @@ class Workplace:
         )
 
     def _scattered(self, translation: float, rotation: float) -> Vector:
-        """What is configured, as far as the calibration bore it out; more scatter comes from the joints.
-
-        The same angle of a joint moves the flange the farther the farther the arm reaches out.
-        """
+        """What is configured, as far as the calibration bore it out; more scatter comes from the joints. The same angle
+        of a joint moves the flange the farther the farther the arm reaches out."""
         angle = self._scatter
         shift = angle if angle == 1.0 else angle * self._farther_out
         return np.diag([(shift * translation) ** 2] * 3 + [(angle * rotation) ** 2] * 3)

@@ -131,10 +131,8 @@ def on_the_way_back(workplace: Workplace, sweep: SweepRecord, context: StepConte
 
 
 def by_times(swath: Swath) -> Vector:
-    """Covariance (6, 6) of base_from_flange by what replies leave open of this sweep's times.
-
-    How late stamps come all the time is the same in two sweeps by one device.
-    """
+    """Covariance (6, 6) of base_from_flange by what replies leave open of this sweep's times. How late stamps come all
+    the time is the same in two sweeps by one device."""
     return _shifted(swath, swath.shift / math.sqrt(3.0))
 
 

@@ -107,10 +107,8 @@ def frame_path(folder: Path, frame_id: int) -> Path:
 
 
 def save_sweep(folder: Path, sweep: SweepRecord, fix: BoardFix, frames: Mapping[str, str] = {}) -> None:
-    """Write what a sweep was taken with, and where the board was seen before it, into the run's `folder`.
-
-    `frames` are the SHA-256 of the frames' files by name; each is one that is on the disk.
-    """
+    """Write what a sweep was taken with, and where the board was seen before it, into the run's `folder`. `frames` are
+    the SHA-256 of the frames' files by name; each is one that is on the disk."""
     data: dict[str, Any] = {
         "format": np.array(FORMAT),
         "base_from_board": fix.base_from_board.homogeneous,
@@ -145,11 +143,8 @@ class StoredSweep:
     def load(
         cls, folder: Path, head: ScanCalibration, scan: ScanSection, exit_point: Vector, *, as_written: bool = True
     ) -> "StoredSweep":
-        """Read it, and extract the stripe from the frames again.
-
-        `RefusedError` when anything of it is missing, no number, or, with `as_written`, was changed: a figure or a
-        frame.
-        """
+        """Read it, and extract the stripe from the frames again. `RefusedError` when anything of it is missing, no
+        number, or, with `as_written`, was changed: a figure or a frame."""
         path = folder / FILE
         try:
             with np.load(path, allow_pickle=False) as data:
@@ -175,10 +170,8 @@ class StoredSweep:
         return cls(folder, SweepRecord(swaths, pointing, doubts, slip), base_from_board, covariance)
 
     def confirmed_by(self, fix: BoardFix) -> SweepRecord:
-        """The sweep, if the board stands where it stood; its covariance holds what two photographs leave open.
-
-        Raises `CalibrationStale` when the board is seen elsewhere: then the sweep says nothing any more.
-        """
+        """The sweep, if the board stands where it stood; its covariance holds what two photographs leave open. Raises
+        `CalibrationStale` when the board is seen elsewhere: then the sweep says nothing any more."""
         moved = moved_by(fix, self.base_from_board, self.board_covariance)
         if moved is not None:
             raise CalibrationStale(f"the board has moved by {moved} since the sweep of run {self.folder.name}")

@@ -269,10 +269,8 @@ def _require_even(rail: str, sweep: Sweep, errors: SweepErrors) -> None:
 
 
 def _residual(sweep: Sweep, devices: Devices, errors: SweepErrors) -> float:
-    """Median distance, m, of the rail's readings in the window from where the sweep has them; 0 without any.
-
-    A simulated world that follows a real rail may have seen it no farther off.
-    """
+    """Median distance, m, of the rail's readings in the window from where the sweep has them; 0 without any. A
+    simulated world that follows a real rail may have seen it no farther off."""
     begin, end = sweep.window
     samples = sweep.samples
     moving = samples[(samples[:, 0] >= begin) & (samples[:, 0] <= end)]

@@ -30,10 +30,8 @@ LONGEST = 1 << 32
 
 @dataclass
 class Parts:
-    """How a file ended: `closed` once its proper end was reached; else `lost` bytes at the end are of no use.
-
-    `damaged` names what does not fit its CRC, and where; chunks among it are left out, `lost` counts their bytes.
-    """
+    """How a file ended: `closed` once its proper end was reached; else `lost` bytes at the end are of no use. `damaged`
+    names what does not fit its CRC, and where; chunks among it are left out, `lost` counts their bytes."""
 
     closed: bool = False
     lost: int = 0
@@ -46,10 +44,8 @@ class Parts:
 
 
 def parts(stream: IO[bytes], told: Parts) -> Iterator[tuple[int, bytes]]:
-    """The records of a file one after the other, those of chunks as well, as far as they are whole.
-
-    `told` says afterwards how the file ended. `CellError` for a file that never was a record.
-    """
+    """The records of a file one after the other, those of chunks as well, as far as they are whole. `told` says
+    afterwards how the file ended. `CellError` for a file that never was a record."""
     size = stream.seek(0, 2)
     good, crc, summary = *_begin(stream), False
     while len(head := stream.read(_HEAD.size)) == _HEAD.size:
@@ -180,9 +176,7 @@ class StoredMessage:
 
 def said(path: Path, told: Parts, topics: tuple[str, ...] = ("/",)) -> Iterator[StoredMessage]:
     """The messages of the topics that begin so, in the file's order, as far as the file goes; `told` as in `parts`.
-
-    `ConfigError` without a file, `CellError` for one that is no record, or where a package for it is not installed.
-    """
+    `ConfigError` without a file, `CellError` for one that is no record, or where a package for it is not installed."""
     if not path.is_file():
         raise ConfigError(f"there is no {path}; a run of an older version leaves none")
     require_packages()

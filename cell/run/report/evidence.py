@@ -86,10 +86,8 @@ def last_frames(result: RunResult, frames: FrameStore) -> list[str]:
 
 
 def textures_of(result: RunResult, nominal: NominalSurface, areas: Sequence[AreaSection]) -> dict[str, Texture]:
-    """The waviness of the scanned surface, by the name "", and of each of its `areas`, by its own.
-
-    Also at a place that was judged and not believed; empty without a place.
-    """
+    """The waviness of the scanned surface, by the name "", and of each of its `areas`, by its own. Also at a place that
+    was judged and not believed; empty without a place."""
     sweep, made, found = (result.results.get(name) for name in ("laser_sweep", "reconstruct", "invert_pose"))
     place = found.base_from_surface if isinstance(found, PlacePose) else RefusalEvidence.of(result).seen.get("pose")
     if not (isinstance(sweep, SweepRecord) and isinstance(made, Reconstruction) and isinstance(place, pin.SE3)):

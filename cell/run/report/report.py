@@ -70,10 +70,8 @@ class FinishedJob:
     frames: FrameStore
 
     def report(self) -> dict[str, Any]:
-        """Everything about the run as JSON-ready data; also `report.json` and `picture.png` in its folder.
-
-        Written before the comparison with the truth and the picture as well: what goes wrong with those is told in it.
-        """
+        """Everything about the run as JSON-ready data; also `report.json` and `picture.png` in its folder. Written
+        before the comparison with the truth and the picture as well: what goes wrong with those is told in it."""
         report: dict[str, Any] = self._of_the_run()
         self._add_place(report)
         report["measured"] = measured(self.result, self.job, None, report["place_bound_95"])

@@ -114,10 +114,8 @@ class Child:
         threading.Thread(target=self._watch_arm, name="arm state", daemon=True).start()
 
     def _take_control(self) -> RTDEControlInterface | None:
-        """The control interface, or None while the arm is not ready for one: its state is still served.
-
-        An arm that another client holds refuses here, before anything on it has been changed.
-        """
+        """The control interface, or None while the arm is not ready for one: its state is still served. An arm that
+        another client holds refuses here, before anything on it has been changed."""
         address = self._setup.address
         ready = not safety_code(self._snapshot.safety_bits) and self._snapshot.mode == MODE_RUNNING
         with _unhurried():
@@ -305,10 +303,8 @@ def _ends_by_itself(seconds: float) -> Iterator[None]:
 
 @contextmanager
 def _unhurried() -> Iterator[None]:
-    """Threads that begin inside this context wake up to `_SLACK_NS` late, and not in real time.
-
-    ur-rtde's looks 10 000 times a second whether a packet has come; it comes every 2 ms.
-    """
+    """Threads that begin inside this context wake up to `_SLACK_NS` late, and not in real time. ur-rtde's looks 10 000
+    times a second whether a packet has come; it comes every 2 ms."""
     slack = Path("/proc/self/timerslack_ns")
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

@@ -18,10 +18,8 @@ KINDS = ("standard", "configurable", "tool")
 
 
 class Packets:
-    """What the arm at `address` sends of itself; OSError when it does not answer, or not any more.
-
-    Over a connection of its own that is waited for: ur-rtde's looks 10 000 times a second whether something has come.
-    """
+    """What the arm at `address` sends of itself; OSError when it does not answer, or not any more. Over a connection of
+    its own that is waited for: ur-rtde's looks 10 000 times a second whether something has come."""
 
     def __init__(self, address: str, switches: bool) -> None:
         """OSError when it `switches` the digital outputs and another client does."""
@@ -74,9 +72,7 @@ _NOT_SAFE = 4
 
 def keep_low(address: str, outputs: tuple[int, ...], free: tuple[int, ...] = ()) -> None:
     """Have the controller keep outputs low whenever no program runs, whatever becomes of the link; `free` stay as set.
-
-    A secondary program runs beside the main one and leaves it alone. Source: the maker's script manual.
-    """
+    A secondary program runs beside the main one and leaves it alone. Source: the maker's script manual."""
     choices = [(index, _LOW_WHEN_NOT_RUNNING) for index in outputs] + [(index, _STAYS) for index in free]
     if not choices:
         return

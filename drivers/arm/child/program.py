@@ -39,9 +39,7 @@ End = tuple[str, str]
 
 class ControlProgram:
     """The program that ur-rtde runs on the arm; without one (`interface` None) nothing moves, but a stop still works.
-
-    `to_stop` is set as long as whatever moves is to come to rest.
-    """
+    `to_stop` is set as long as whatever moves is to come to rest."""
 
     def __init__(self, setup: ChildSetup, interface: RTDEControlInterface, latest: Callable[[], Snapshot]) -> None:
         self.to_stop = threading.Event()

@@ -159,9 +159,7 @@ class BlockCount:
 
 class Acquisition:
     """An acquisition from `start` to `stop`; `take(picture)` is called in its thread, `failed()` when it ended badly.
-
-    `failure` is then why; `incomplete` counts the pictures that were dropped because packets were missing.
-    """
+    `failure` is then why; `incomplete` counts the pictures that were dropped because packets were missing."""
 
     def __init__(
         self, device: GenicamDevice, network: GigeCameraConfig | None, buffers: int,

@@ -107,10 +107,8 @@ class GenicamCamera:
 
     @contextmanager
     def stream(self) -> Iterator[FrameQueue]:
-        """Frames at the configured rate, or at the pulses of the trigger's line, while the context is open.
-
-        One at a time. Frames that nobody takes are kept up to 64 MB; later ones are dropped and counted as lost.
-        """
+        """Frames at the configured rate, or at the pulses of the trigger's line, while the context is open. One at a
+        time. Frames that nobody takes are kept up to 64 MB; later ones are dropped and counted as lost."""
         with self._exclusive() as device:
             self._stamps.compare(device)
             set_trigger(device, self._record, self._timing(device), photograph=False)

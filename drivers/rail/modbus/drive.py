@@ -119,10 +119,8 @@ class DriveZero:
         """Whether this program saw the search end; what an earlier one found may be long ago."""
 
     def held(self, when: str = "since its last motion") -> bool:
-        """Whether the drive, asked now, counts from a zero that a homing found.
-
-        Raises `DeviceFault` (rail.reset), once, when it did before and does not any more.
-        """
+        """Whether the drive, asked now, counts from a zero that a homing found. Raises `DeviceFault` (rail.reset),
+        once, when it did before and does not any more."""
         homed = self._drive.says(self._drive.registers.homed)
         lost, self._seen = self._seen and not homed, homed
         if not homed:
@@ -153,11 +151,8 @@ class DriveZero:
         self._seen = False
 
     def found(self) -> bool:
-        """Whether the search has ended at its zero.
-
-        Raises `DeviceFault`: rail.not_begun when the drive does not begin, rail.alarm, and rail.setting when it counts
-        from somewhere else.
-        """
+        """Whether the search has ended at its zero. Raises `DeviceFault`: rail.not_begun when the drive does not begin,
+        rail.alarm, and rail.setting when it counts from somewhere else."""
         drive, registers = self._drive, self._drive.registers
         homed, moving = drive.says(registers.homed), drive.says(registers.moving)
         if self._homed_since is not None:

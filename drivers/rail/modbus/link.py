@@ -57,10 +57,8 @@ class ModbusRefused(DeviceFault):
 
 
 class ModbusLink(RailLink):
-    """A serial port (device path or pyserial URL) with the drive `unit` on it.
-
-    Raises `NotConnectedError` when the port cannot be opened.
-    """
+    """A serial port (device path or pyserial URL) with the drive `unit` on it. Raises `NotConnectedError` when the port
+    cannot be opened."""
 
     DRIVE, REPLY_S = "drive", REPLY_TIMEOUT_S
 

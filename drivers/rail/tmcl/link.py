@@ -123,11 +123,8 @@ def checksum(body: bytes) -> int:
 
 
 def decode_reply(data: bytes, request: TmclRequest) -> TmclReply:
-    """Read the answer to `request`.
-
-    Raises `TelegramError` when `data` is not nine bytes, fails its checksum, or comes from another module or from
-    another command: a late answer to an earlier question is not this one's.
-    """
+    """Read the answer to `request`. Raises `TelegramError` when `data` is not nine bytes, fails its checksum, or comes
+    from another module or from another command: a late answer to an earlier question is not this one's."""
     if len(data) != TELEGRAM_BYTES:
         raise TelegramError(f"{len(data)} bytes instead of {TELEGRAM_BYTES}")
     if checksum(data[:-1]) != data[-1]:
@@ -176,10 +173,8 @@ class CommandRefused(DeviceFault):
 
 
 class TmclLink(RailLink):
-    """A serial port (device path or pyserial URL) with one module at `address` on it.
-
-    Raises `NotConnectedError` when the port cannot be opened.
-    """
+    """A serial port (device path or pyserial URL) with one module at `address` on it. Raises `NotConnectedError` when
+    the port cannot be opened."""
 
     DRIVE, REPLY_S = "module", REPLY_TIMEOUT_S
 

@@ -64,10 +64,8 @@ def require_supported(name: str, firmware: str) -> None:
 
 
 def set_checked(link: TmclLink, axis: Axis, value: int, rounding: Rounding, *, issued: int | None = None) -> None:
-    """Write an axis parameter and read it back; `DeviceFault` (rail.setting) when the module has another value.
-
-    With `issued` it is not written after a stop.
-    """
+    """Write an axis parameter and read it back; `DeviceFault` (rail.setting) when the module has another value. With
+    `issued` it is not written after a stop."""
     link.set(axis, value, issued=issued)
     found = link.get(axis)
     if not rounding.holds(value, found):
@@ -83,10 +81,8 @@ def set_checked(link: TmclLink, axis: Axis, value: int, rounding: Rounding, *, i
 
 
 def set_ramp(link: TmclLink, acceleration: int) -> None:
-    """Make positioning a trapezium of one `acceleration` (pulses/s²) both ways, and read back that it is.
-
-    What a module does not have is left out: then there is nothing in it that bends the ramp.
-    """
+    """Make positioning a trapezium of one `acceleration` (pulses/s²) both ways, and read back that it is. What a module
+    does not have is left out: then there is nothing in it that bends the ramp."""
     # Some firmware knows units of its own as well, and says which in parameter 255.
     if link.get_if_there(Axis.UNIT_MODE) not in (None, PULSES_MODE):
         set_checked(link, Axis.UNIT_MODE, PULSES_MODE, EXACT)
@@ -137,10 +133,8 @@ _ALARMS = (
 
 
 def readings(driver_bits: int) -> list[Reading]:
-    """One figure for each alarm in axis parameter 208, 1 where it is set.
-
-    Open load is left out: a motor that stands shows it without cause.
-    """
+    """One figure for each alarm in axis parameter 208, 1 where it is set. Open load is left out: a motor that stands
+    shows it without cause."""
     return [Reading(what, float(bool(driver_bits & bits)), "", most=0.0, remedy=why) for what, bits, why in _ALARMS]
 
 
@@ -156,10 +150,8 @@ _log = logging.getLogger(__name__)
 
 
 class ZeroMark:
-    """The mark on the module behind `link`.
-
-    `settings` are what a position in counts depends on; a module set up by other ones is not homed for this program.
-    """
+    """The mark on the module behind `link`. `settings` are what a position in counts depends on; a module set up by
+    other ones is not homed for this program."""
 
     def __init__(self, link: TmclLink, settings: tuple[object, ...]) -> None:
         self._link = link
@@ -205,10 +197,8 @@ class ZeroMark:
         self._seen = self.found_here = True
 
     def held(self) -> bool:
-        """Whether the module, asked now, counts from a zero that a homing of this configuration found.
-
-        Raises `DeviceFault` (rail.reset), once, when it did before and does not any more.
-        """
+        """Whether the module, asked now, counts from a zero that a homing of this configuration found. Raises
+        `DeviceFault` (rail.reset), once, when it did before and does not any more."""
         if self._distrusted:
             return False
         held = self._link.user_variable(MARK_VARIABLE) == self._value

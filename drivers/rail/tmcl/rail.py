@@ -81,10 +81,8 @@ class TmclRail(RailAxis):
         return [] if bits is None else module.readings(bits)
 
     def state(self) -> RailState:
-        """Read position, velocity, switches and whether it is homed now.
-
-        Raises `DeviceFault` (rail.reset), once, when the module has lost the zero that it had.
-        """
+        """Read position, velocity, switches and whether it is homed now. Raises `DeviceFault` (rail.reset), once, when
+        the module has lost the zero that it had."""
         counts, stamp, _ = self._link.get_stamped(Axis.POSITION)
         velocity = self._link.get(Axis.VELOCITY) / self._counts
         return RailState(

@@ -241,10 +241,8 @@ class Master:
             self.bus.command(drive.node, od.START)
 
     def lock_brakes(self, *, locked: bool) -> None:
-        """Switch brakes that hang on outputs; others follow the drives' states.
-
-        A drive whose brake cannot be locked keeps no other one open: the first error is raised after all were tried.
-        """
+        """Switch brakes that hang on outputs; others follow the drives' states. A drive whose brake cannot be locked
+        keeps no other one open: the first error is raised after all were tried."""
         if self._wheels.brake_output is None:
             return
         failed: list[CellError] = []

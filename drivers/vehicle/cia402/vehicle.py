@@ -215,11 +215,8 @@ class CanopenVehicle:
             self._in_command = True
 
     def drive(self, speed: float, yaw_rate: float) -> None:
-        """Set the velocity, m/s and rad/s; must be renewed within 0.5 s or it becomes zero.
-
-        Raises `LimitError`, `InterlockError` before `enable()`, `DeviceFault` as `check` does, `Aborted` while a stop
-        is under way.
-        """
+        """Set the velocity, m/s and rad/s; must be renewed within 0.5 s or it becomes zero. Raises `LimitError`,
+        `InterlockError` before `enable()`, `DeviceFault` as `check` does, `Aborted` while a stop is under way."""
         speed = check_range(self.name, "speed", speed, low=-self._max_speed, high=self._max_speed, unit="m/s")
         yaw_rate = check_range(self.name, "yaw rate", yaw_rate, -self._max_yaw_rate, self._max_yaw_rate, unit="rad/s")
         self._bus.require_unspoken()
@@ -238,10 +235,8 @@ class CanopenVehicle:
         raise InterlockError(self.name, f"{reason}, so it would not move. Call enable() first")
 
     def stop(self) -> None:
-        """Halt at once and wait until both drives report standstill; `DeadlineError` after 4 s.
-
-        Drives that do not follow the ramp of the halt are stopped with the quick stop.
-        """
+        """Halt at once and wait until both drives report standstill; `DeadlineError` after 4 s. Drives that do not
+        follow the ramp of the halt are stopped with the quick stop."""
         if self._look:
             return
         with self._master.command:
@@ -268,10 +263,8 @@ class CanopenVehicle:
                 self._master.stops -= 1
 
     def brake(self) -> None:
-        """Stop, wait for standstill and lock the brake; it stays locked until `enable()`.
-
-        The brake is locked also when standstill is not reported in time, which is raised afterwards.
-        """
+        """Stop, wait for standstill and lock the brake; it stays locked until `enable()`. The brake is locked also when
+        standstill is not reported in time, which is raised afterwards."""
         if self._look:
             return
         with self._master.command:

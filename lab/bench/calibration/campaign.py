@@ -45,10 +45,8 @@ DRAWS = 200
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """Covariance (26, 26) that no unbiased calibration of this head under this noise can be below.
-
-    `error` (26,) is what the best calibration, one that attains the bound, makes of the observations that were given.
-    """
+    """Covariance (26, 26) that no unbiased calibration of this head under this noise can be below. `error` (26,) is
+    what the best calibration, one that attains the bound, makes of the observations that were given."""
 
     covariance: Array
     error: Array = field(default_factory=lambda: np.zeros(SHARED))
@@ -61,10 +59,8 @@ class Bound:
 
 
 def cramer_rao(world: HeadWorld, noise: Noise, observations: Sequence[ScanObservation] | None = None) -> Bound:
-    """The bound; poses of the flange and positions of the rail are unknowns that are read with their noise.
-
-    With `observations`, one of each view, the bound is that of the dots that they hold, and has their best error.
-    """
+    """The bound; poses of the flange and positions of the rail are unknowns that are read with their noise. With
+    `observations`, one of each view, the bound is that of the dots that they hold, and has their best error."""
     total, score = np.zeros((SHARED, SHARED)), np.zeros(SHARED)
     prior = np.diag(1 / noise.own**2)
     nothing = np.zeros(OWN)
@@ -247,9 +243,7 @@ def _parameter_errors(state: Any, world: HeadWorld) -> Array:
 
 def summed_up(trials: Sequence[Trial], noise: Noise) -> dict[str, Any]:
     """Means over the seeds; `z_rms` of all z-scores, by parameter, and of their independent parts; lengths in mm.
-
-    `ratio` compares with the bound, `ratio_same_noise` with what the best calibration makes of the very noise drawn.
-    """
+    `ratio` compares with the bound, `ratio_same_noise` with what the best calibration makes of the very noise drawn."""
     z = {name: np.array([t.z[name] for t in trials]) for name in trials[0].z}
     frames = {}
     for frame in FRAMES:
@@ -281,9 +275,7 @@ def measured_errors(
     world: HeadWorld, estimate: HeadWorld, best: Bound, frame: str, noise: Noise, rng: np.random.Generator
 ) -> dict[str, float]:
     """Errors in mm in one frame: `mean`, `max`, `p85` of the estimate; `best_mean` on the same noise; `bound_mean`.
-
-    Stripe and rail (and the arm, in its base) have fresh noise, as when a surface is scanned.
-    """
+    Stripe and rail (and the arm, in its base) have fresh noise, as when a surface is scanned."""
     count = BASE_POINTS if frame == "base" else SCAN_POINTS
     pixels, rails = sweep_points(world, count, rng)
     truth = _in_frame(world, pixels, rails, frame)

@@ -107,9 +107,7 @@ class ObservedCell:
 
     def carriage(self, reading: float) -> float:
         """Where the carriage stands for a rail reading, both in m: backlash from either side, periodic error, homing.
-
-        The lead's error is in `Truth.rail_direction`.
-        """
+        The lead's error is in `Truth.rail_direction`."""
         scene = self.scene
         side = 0.5 * scene.rail_backlash * self.rng.choice((-1.0, 1.0))
         periodic = scene.rail_periodic_amplitude * np.sin(2 * np.pi * reading / 0.002 + scene.rail_periodic_phase)

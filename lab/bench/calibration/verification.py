@@ -134,10 +134,8 @@ def look_again(cell: ObservedCell, calibration: CellCalibration) -> CheckObserva
 def campaign(
     seeds: Sequence[int], level: str, chosen: Sequence[Disturbance], progress: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Calibrate each seed's world, check it as it is and under each disturbance; for reports.
-
-    Beside each disturbance stands what the verifications said of the size they find of its kind.
-    """
+    """Calibrate each seed's world, check it as it is and under each disturbance; for reports. Beside each disturbance
+    stands what the verifications said of the size they find of its kind."""
     config, job = load_config(None), load_job("pot")[0]
     alarms: list[list[bool]] = []
     told: list[bool] = []

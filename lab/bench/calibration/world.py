@@ -33,9 +33,7 @@ STRIPE_WIDTH_PX = 1.5
 @dataclass(frozen=True)
 class Noise:
     """One standard deviation each: dots and stripe in px, rail in m, arm in m (radial, 1/√3 of it per axis) and rad.
-
-    The defaults are those of docs/explanation/theory.md, section 12.
-    """
+    The defaults are those of docs/explanation/theory.md, section 12."""
 
     dots: float = 0.05
     stripe: float = 0.07

@@ -35,10 +35,8 @@ BORE, SINK = 0.0030, 0.0055
 
 @dataclass(frozen=True)
 class Part:
-    """A part: `height(x, y)` in m, NaN where there is none.
-
-    symmetry: "axis" turns about its z axis, "centre" about `centre` (m, surface frame) onto itself.
-    """
+    """A part: `height(x, y)` in m, NaN where there is none. symmetry: "axis" turns about its z axis, "centre" about
+    `centre` (m, surface frame) onto itself."""
 
     name: str
     title: str

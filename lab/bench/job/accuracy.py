@@ -43,9 +43,7 @@ WANTED = (0.90, 0.98)
 
 def campaign(seeds: Sequence[int], levels: Sequence[str], job: str, done: Done, workers: int = 0) -> dict[str, Any]:
     """Run every seed at every level and sum up; `done` is told in words of each run and acceptance test that ended.
-
-    `workers` processes, by default one a core. Figures of one level stand at the top as well, that of the first.
-    """
+    `workers` processes, by default one a core. Figures of one level stand at the top as well, that of the first."""
     load_job(job)
     worlds = [(one_run, job, seed, level) for level in levels for seed in seeds]
     tests = [(acceptance, seeds[0], level) for level in levels]

@@ -22,10 +22,8 @@ MIDDLE = (0.022, 1.0)
 def body(
     vertices: Floats, faces: Faces, changed: Callable[[Floats], Floats] = lambda corners: corners, *, flat: bool = False
 ) -> trimesh.Trimesh:
-    """A closed body on the surface; `changed` gives the underside's corners (n, 3), m, as they are drawn instead.
-
-    Its top is that of a shell, or `flat`.
-    """
+    """A closed body on the surface; `changed` gives the underside's corners (n, 3), m, as they are drawn instead. Its
+    top is that of a shell, or `flat`."""
     top = vertices + np.array([0.0, 0.0, HEIGHT])
     if flat:
         top[:, 2] = top[:, 2].max()
@@ -51,9 +49,7 @@ def job_with_part(
     half: tuple[float, float] = ALL, flat: bool = False, also: str = "corrections = 0",
 ) -> Path:  # fmt: skip
     """A shipped job in `folder`, with a mesh of its part beside it: what `load_job` reads. `also` is of its [place].
-
-    Raises `ConfigError` for a name that does not ship.
-    """
+    Raises `ConfigError` for a name that does not ship."""
     job, mesh = load_job(name)
     assert np.allclose(job.place.surface_from_part.se3().homogeneous, np.eye(4))
     surface = within(*read_mesh(mesh, job.surface.mesh_unit), half)

@@ -34,9 +34,7 @@ def campaign(
     seeds: Sequence[int], level: str, job: str, names: Sequence[str], place: str, done: Done, workers: int = 0
 ) -> Row:
     """Run each effect of `names` on each seed; `place` are lines of the job's [place], `done` is told of each run.
-
-    Raises `ConfigError` for an unknown effect.
-    """
+    Raises `ConfigError` for an unknown effect."""
     if unknown := [name for name in names if name not in EFFECTS]:
         raise ConfigError(f"--effect {unknown[0]!r}: allowed are {', '.join(EFFECTS)}")
 

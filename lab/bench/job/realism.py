@@ -102,10 +102,8 @@ def part_inside(record: JobRecord, job: Job) -> bool | None:
 
 
 def verdict(run: dict[str, Any]) -> str:
-    """Inside what was stated; or named: refused by the effect's name; or refused otherwise; or outside.
-
-    What was placed outside is outside, whatever was noted: a note says what the measurements have allowed for.
-    """
+    """Inside what was stated; or named: refused by the effect's name; or refused otherwise; or outside. What was placed
+    outside is outside, whatever was noted: a note says what the measurements have allowed for."""
     if run["outcome"] == "placed":
         return "inside" if run["pose_inside"] and run["part_inside"] else "outside"
     names = Effects.names() if run["effect"] == TOGETHER else (run["effect"],)

@@ -68,10 +68,8 @@ class _Compared:
 
 
 def scan_errors(record: JobRecord, nominal: NominalSurface, kinematic: Vector) -> ScanErrors | None:
-    """The errors of a record's cloud, None when it has none.
-
-    `kinematic` (6, 6), m² and rad²: the covariance that is stated of a place in the base that the arm realises.
-    """
+    """The errors of a record's cloud, None when it has none. `kinematic` (6, 6), m² and rad²: the covariance that is
+    stated of a place in the base that the arm realises."""
     made = record.results.get("reconstruct")
     if not isinstance(made, Reconstruction):
         return None
@@ -101,10 +99,8 @@ def scan_errors(record: JobRecord, nominal: NominalSurface, kinematic: Vector) -
 
 
 def own_base(record: JobRecord) -> pin.SE3:
-    """own_from_base: the base as the arm realises it in the posture in which it places, against the true base.
-
-    From the true lengths and zeros of the world's arm and what its joints are off; repeatability is not part of it.
-    """
+    """own_from_base: the base as the arm realises it in the posture in which it places, against the true base. From the
+    true lengths and zeros of the world's arm and what its joints are off; repeatability is not part of it."""
     assert record.rests is not None
     pose = record.results.get("place")
     scene = draw(record.seed, record.level)
@@ -120,10 +116,8 @@ def own_base(record: JobRecord) -> pin.SE3:
 
 
 def surface_at_middle(record: JobRecord) -> pin.SE3:
-    """base_from_surface when the arm was in the middle of all lines: a vehicle leans otherwise wherever it reaches.
-
-    Its rocking is averaged out, over all lines that were taken with the arm there.
-    """
+    """base_from_surface when the arm was in the middle of all lines: a vehicle leans otherwise wherever it reaches. Its
+    rocking is averaged out, over all lines that were taken with the arm there."""
     flanges = np.array([shot.base_from_flange[:3, 3] for shot in record.shots])
     away = np.linalg.norm(flanges - flanges.mean(axis=0), axis=1)
     there = np.flatnonzero(away < away.min() + _SAME_PLACE_M)

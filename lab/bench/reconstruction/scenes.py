@@ -151,10 +151,7 @@ def swept(
     base_from_flange: pin.SE3, least_points: int = 500,
 ) -> Cloud:  # fmt: skip
     """The cloud of profiles, each with the rail's reading ± `rail_sigma`, m, in the rail's order; the flange stood
-    still all along.
-
-    Raises `RefusedError` when fewer than `least_points` points are left.
-    """
+    still all along. Raises `RefusedError` when fewer than `least_points` points are left."""
     builder, readings = ProfileBuilder(geometry, 2), []
     for profile, reading in profiles:
         builder.see(profile)

@@ -45,10 +45,8 @@ def make_well(virtual: VirtualCell) -> None:
 
 
 class Computer:
-    """The computer of the cell: its disk may be full, its clock be set; only inside its context.
-
-    A full disk is the process's limit of a file's size: nothing that is written makes a file longer.
-    """
+    """The computer of the cell: its disk may be full, its clock be set; only inside its context. A full disk is the
+    process's limit of a file's size: nothing that is written makes a file longer."""
 
     def __enter__(self) -> Self:
         self._limits = resource.getrlimit(resource.RLIMIT_FSIZE)

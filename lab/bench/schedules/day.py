@@ -41,10 +41,8 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class DayRecord:
-    """What became of a schedule: `ends` of each run (outcome and reason), and where each entry happened.
-
-    `met` has the state or step, the act, and how the run ended in which it happened.
-    """
+    """What became of a schedule: `ends` of each run (outcome and reason), and where each entry happened. `met` has the
+    state or step, the act, and how the run ended in which it happened."""
 
     schedule: Schedule
     ends: tuple[tuple[str, str], ...]

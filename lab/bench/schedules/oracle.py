@@ -49,10 +49,8 @@ class Violation:
 
 @dataclass(frozen=True)
 class RunEnd:
-    """How a run ended in its own words; `part` is what its journal tells last of the part, None if nothing.
-
-    `tolerance` and `bound` (m) are the job's, and what the report states that the part is off by at most, if it does.
-    """
+    """How a run ended in its own words; `part` is what its journal tells last of the part, None if nothing. `tolerance`
+    and `bound` (m) are the job's, and what the report states that the part is off by at most, if it does."""
 
     outcome: str
     reason: str
@@ -63,11 +61,8 @@ class RunEnd:
 
 @dataclass(eq=False)
 class Oracle:
-    """The judge of one world. `tick` is called after each of the world's ticks.
-
-    `camera` counts the scan camera's exposures; `home` is where a part lies at first: "held", "at the station" or "in
-    its nest".
-    """
+    """The judge of one world. `tick` is called after each of the world's ticks. `camera` counts the scan camera's
+    exposures; `home` is where a part lies at first: "held", "at the station" or "in its nest"."""
 
     world: World
     camera: CameraState

@@ -40,9 +40,7 @@ AMOUNTS: dict[str, Callable[[np.random.Generator], float]] = {
 @dataclass(frozen=True)
 class Entry:
     """`act` happens when so much (`share`) of what step `step` usually lasts has passed since it began; "" is the run.
-
-    `amount` is its size, see `AMOUNTS`; `meanwhile` happens while it holds the run.
-    """
+    `amount` is its size, see `AMOUNTS`; `meanwhile` happens while it holds the run."""
 
     act: str
     step: str = ""
@@ -95,9 +93,7 @@ def draw(
     wanted: Callable[[str, str], float] = lambda step, act: 1.0,
 ) -> Schedule:  # fmt: skip
     """The schedule of `seed`, of the `jobs` (each with the names of its steps), `levels` and `seeds` of worlds.
-
-    `wanted(step, act)` weighs what may happen where.
-    """
+    `wanted(step, act)` weighs what may happen where."""
     rng = np.random.default_rng([seed, 26])
     job, steps = jobs[int(rng.integers(len(jobs)))]
     level, world = str(rng.choice(list(levels))), int(rng.choice(list(seeds)))

@@ -55,9 +55,7 @@ _LASTS_S = {
 @dataclass(frozen=True)
 class Ending:
     """One trial: what was ended and how, when in it (s of the cell), and when something moved or shone last (wall s).
-
-    `what_moved` names what still did after `LIMIT_S`; `exit_code` is the process's, negative for a kill.
-    """
+    `what_moved` names what still did after `LIMIT_S`; `exit_code` is the process's, negative for a kill."""
 
     work: str
     way: str

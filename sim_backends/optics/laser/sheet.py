@@ -38,9 +38,7 @@ def lit(
     points: Vector, normals: Vector, instance: SceneObject, scene: Sequence[SceneObject], laser: LaserOptics
 ) -> Mask:
     """Which `points` (n, 3) with surface `normals` (n, 3) of `instance` are lit and seen past every object of `scene`.
-
-    A surface is lit and seen when laser and camera are on the same side of it.
-    """
+    A surface is lit and seen when laser and camera are on the same side of it."""
     normal, _, origin = laser_frame(laser)
     axis = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
     points = np.ascontiguousarray(points)

@@ -158,10 +158,8 @@ def _spread(instance: PlaneInstance, laser: LaserOptics) -> Vector:
 def seen_part(
     ax: float, ay: float, az: float, dx: float, dy: float, dz: float, reach_x: float, reach_y: float
 ) -> tuple[float, float]:
-    """Where, from 0 to 1, a segment from a along d is in front of the camera and within its cone.
-
-    Beyond it the distortion folds back.
-    """
+    """Where, from 0 to 1, a segment from a along d is in front of the camera and within its cone. Beyond it the
+    distortion folds back."""
     low, high = 0.0, 1.0
     for side in range(5):
         if side == 0:

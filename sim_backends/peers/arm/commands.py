@@ -28,10 +28,8 @@ _KEEP, _, _HIGH, _HIGH_ONLY_WHILE_RUNNING = range(4)
 
 
 class HeldOutputs:
-    """What each output does while no program runs; such a setting outlives programs until it is changed.
-
-    Source: the script manual, `set_runstate_standard_digital_output_to_value` and its like for the other outputs.
-    """
+    """What each output does while no program runs; such a setting outlives programs until it is changed. Source: the
+    script manual, `set_runstate_standard_digital_output_to_value` and its like for the other outputs."""
 
     def __init__(self, model: ArmModel) -> None:
         self._model = model
@@ -45,10 +43,8 @@ class HeldOutputs:
                 self._model.write_digital_outputs(1 << index, int(level) << index)
 
     def choose(self, index: int, choice: int) -> None:
-        """What output `index` does while no program runs: 0 stays, 1 low, 2 high, 3 high only while one does.
-
-        Raises ValueError for another choice.
-        """
+        """What output `index` does while no program runs: 0 stays, 1 low, 2 high, 3 high only while one does. Raises
+        ValueError for another choice."""
         if choice not in range(4):
             raise ValueError(f"a choice of {choice}, 0 to 3 are known")
         self._choices.pop(index, None)

@@ -38,10 +38,8 @@ _UNNAMED = "<unnamed>"
 
 
 class DashboardServer:
-    """Answers dashboard commands for one arm and its program; `programs` is where `load` finds its programs.
-
-    A program NAME.urp is the URScript text of the file NAME.script there.
-    """
+    """Answers dashboard commands for one arm and its program; `programs` is where `load` finds its programs. A program
+    NAME.urp is the URScript text of the file NAME.script there."""
 
     def __init__(self, model: ArmModel, program: ProgramMemory, programs: Path | None = None) -> None:
         self._model = model

@@ -100,10 +100,8 @@ class TcpPorts:
     """Listening sockets on `ports` of one address in 127.0.0.0/8."""
 
     def __init__(self, ports: Sequence[int], host: str | None = None) -> None:
-        """Bind on `host`, or on the first of 127.0.n.2 … 127.0.n.254 where all ports are free; OSError if none is.
-
-        n follows from the process: a client of an arm that has died must not find another one at its address.
-        """
+        """Bind on `host`, or on the first of 127.0.n.2 … 127.0.n.254 where all ports are free; OSError if none is. n
+        follows from the process: a client of an arm that has died must not find another one at its address."""
         net = os.getpid() % 250
         hosts = [host] if host is not None else [f"127.0.{net}.{i}" for i in range(2, 255)]
         self._listeners: dict[int, tuple[int, socket.socket]] = {}

@@ -26,10 +26,8 @@ _RESUMING_CYCLES = 50
 
 
 class Announcement(NamedTuple):
-    """What the clients of the primary port are told: text, popup, started, stopped or failed, and its words.
-
-    What failed has a place in its script, from 1; 0 where none is known.
-    """
+    """What the clients of the primary port are told: text, popup, started, stopped or failed, and its words. What
+    failed has a place in its script, from 1; 0 where none is known."""
 
     kind: str
     words: str

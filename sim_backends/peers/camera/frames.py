@@ -40,11 +40,8 @@ def message(header: dict[str, object], payload: bytes = b"") -> bytes:
 
 
 def receive(connection: socket.socket) -> dict[str, object] | None:
-    """The next request's header; None at the end of the connection.
-
-    A header that is no JSON object comes back as a request that nobody knows. Raises Rejected when the stream is not
-    this protocol at all.
-    """
+    """The next request's header; None at the end of the connection. A header that is no JSON object comes back as a
+    request that nobody knows. Raises Rejected when the stream is not this protocol at all."""
     prefix = _read(connection, _PREFIX.size)
     if prefix is None:
         return None

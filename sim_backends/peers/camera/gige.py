@@ -32,9 +32,7 @@ _PAUSE_S = 0.0005
 
 class GigeStream:
     """Sends from the address `host` what the registers in `read` say: format, region, gain, packet size, destination.
-
-    `lost(number of a packet in its picture)` decides which packets get lost on their first way.
-    """
+    `lost(number of a packet in its picture)` decides which packets get lost on their first way."""
 
     def __init__(self, host: str, read: gigevision.GigeMemory) -> None:
         self.lost: Callable[[int], bool] = lambda number: False
@@ -109,11 +107,8 @@ class GigePeer:
     """Serves one camera at `address`, an address in 127.0.0.0/8."""
 
     def __init__(self, name: str, clock: WorldClock, render: Render, spec: CameraSpec) -> None:
-        """Bind on the first free address of this process; OSError when none is.
-
-        `render` is called in the session's thread, once the exposure that it is to show is over; it gives the whole
-        sensor.
-        """
+        """Bind on the first free address of this process; OSError when none is. `render` is called in the session's
+        thread, once the exposure that it is to show is over; it gives the whole sensor."""
         self.name = name
         self.camera = CameraState(spec)
         self._clock = clock

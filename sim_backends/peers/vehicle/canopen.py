@@ -30,9 +30,7 @@ CURRENT, BLOCKED = 0x2310, 0x7121
 @dataclass(frozen=True)
 class CanopenSettings:
     """The drives as a configuration describes them; lengths in m. See the configuration's keys of these names.
-
-    `brake_bit` and `stop_bit` are bits of outputs and inputs, or None.
-    """
+    `brake_bit` and `stop_bit` are bits of outputs and inputs, or None."""
 
     left_node: int = 1
     right_node: int = 2
@@ -66,9 +64,7 @@ class WheelState(Enum):
 
 class WheelDrive:
     """A drive that was just switched on. `stays` tells how its quick stop ends: at rest with or without power.
-
-    `connection_lost_as` is what it does when its master is gone: 0 nothing, 1 fault, 2 without power, 3 quick stop.
-    """
+    `connection_lost_as` is what it does when its master is gone: 0 nothing, 1 fault, 2 without power, 3 quick stop."""
 
     def __init__(self) -> None:
         self.state = WheelState.DISABLED

@@ -172,10 +172,8 @@ _TICK = 0.005
 
 
 class CanPeer(ABC):
-    """A vehicle on the bus: serves it as slcan adapters at `channel` and lets the vehicle's time pass.
-
-    Open it with python-can: `Bus(interface=peer.interface, channel=peer.channel, sleep_after_open=0)`.
-    """
+    """A vehicle on the bus: serves it as slcan adapters at `channel` and lets the vehicle's time pass. Open it with
+    python-can: `Bus(interface=peer.interface, channel=peer.channel, sleep_after_open=0)`."""
 
     interface = "slcan"
     FAULTS: tuple[str, ...]
@@ -206,10 +204,8 @@ class CanPeer(ABC):
         self._bus.stop()
 
     def fault(self, name: str) -> None:
-        """`can.bus_off`: the adapters drop out and have to be opened again; or one of the vehicle's own.
-
-        Raises ValueError for a name that is not in `FAULTS`.
-        """
+        """`can.bus_off`: the adapters drop out and have to be opened again; or one of the vehicle's own. Raises
+        ValueError for a name that is not in `FAULTS`."""
         if name == "can.bus_off":
             self._bus.drop()
         elif name in VEHICLE_MODEL_FAULTS:

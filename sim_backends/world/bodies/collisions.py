@@ -90,10 +90,8 @@ class ArmPoints:
         self._part = moved_by(part, station.flange_from_part)
 
     def at(self, frames: Pose, flange_from_scan: Pose, held: bool) -> Vector:
-        """The points (n, 3) in the arm's base; `frames` (7, 4, 4) are those of base and links, the last the flange's.
-
-        A part that the claw does not hold is left out: its points are at the flange, inside the wrist.
-        """
+        """The points (n, 3) in the arm's base; `frames` (7, 4, 4) are those of base and links, the last the flange's. A
+        part that the claw does not hold is left out: its points are at the flange, inside the wrist."""
         along = frames[self._first, :3, 2]
         start = frames[self._first, :3, 3] + self._offset * along
         end = frames[self._last, :3, 3] + self._rise * along
@@ -199,10 +197,8 @@ class Collisions:
         return True
 
     def arm(self, time: float, points: Vector, world_from_vehicle: Pose) -> str | None:
-        """What the arm has just met, in words, or None: `points` (n, 3) as of `ArmPoints.at`, in the world.
-
-        The part touches only what is not the ground here.
-        """
+        """What the arm has just met, in words, or None: `points` (n, 3) as of `ArmPoints.at`, in the world. The part
+        touches only what is not the ground here."""
         in_base = moved_by(moved_by(points, inverse(world_from_vehicle)), self._base_from_vehicle)
         depths = [self._standing_boxes.depths(points), self._on_vehicle.depths(in_base)]
         if not self._ground.clear(points, self._arm.radius):
@@ -265,9 +261,7 @@ class _Boxes:
 
     def depths(self, points: Vector) -> Vector:
         """How deep (m, n) each of `points` (n, 3) is inside each of the boxes; outside of one the distance, negative.
-
-        In one go: it is asked for twenty times in a second of the world.
-        """
+        In one go: it is asked for twenty times in a second of the world."""
         beyond = np.abs(points @ self._turns + self._shifts) - self._half
         outside = np.sqrt((np.maximum(beyond, 0.0) ** 2).sum(axis=-1))
         depth: Vector = -np.where(outside > 0.0, outside, beyond.max(axis=-1))

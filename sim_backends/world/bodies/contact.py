@@ -57,10 +57,8 @@ class Nest:
 
 
 class PartContact:
-    """Where the part is and what forces act on it; safe between threads.
-
-    At the start the claw holds the part at `flange_from_part`. The table reaches 0.25 m around the surface's origin.
-    """
+    """Where the part is and what forces act on it; safe between threads. At the start the claw holds the part at
+    `flange_from_part`. The table reaches 0.25 m around the surface's origin."""
 
     def __init__(
         self, surface: Surface, world_from_surface: Pose, flange_from_part: Pose, *,

@@ -161,11 +161,8 @@ def surface(name: str) -> Surface:
 
 @cache
 def mesh(name: str, triangles: int = 80_000, walls: bool = True) -> SurfaceMesh:
-    """A regular grid mesh of the surface `name` with about `triangles` triangles, in S.
-
-    `walls` adds the sides from the border down to the table, as seen by a camera. Raises ValueError for an unknown
-    name or fewer than 100 triangles.
-    """
+    """A regular grid mesh of the surface `name` with about `triangles` triangles, in S. `walls` adds the sides from the
+    border down to the table, as seen by a camera. Raises ValueError for an unknown name or fewer than 100 triangles."""
     field = surface(name)
     if triangles < 100:
         raise ValueError(f"a surface mesh of {triangles} triangles is too coarse: ask for 100 or more")

@@ -21,10 +21,8 @@ RUBBISH = ("[]", "x" * 2000)
 
 
 class Flood:
-    """`SESSIONS` browsers of `server`, each with its own link, that try to say `PER_S` things a second; a context.
-
-    At its end `rate` is how many they said a second.
-    """
+    """`SESSIONS` browsers of `server`, each with its own link, that try to say `PER_S` things a second; a context. At
+    its end `rate` is how many they said a second."""
 
     def __init__(self, server: Served) -> None:
         keys = [server.enter() for _ in range(SESSIONS)]

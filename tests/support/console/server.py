@@ -23,9 +23,7 @@ HOSTS = ("127.0.0.1", "localhost")
 
 class Served:
     """The server, and this side of its pipes: `heard` are its messages, `stops` counts what its stop pipe asked for.
-
-    `begun` says when, and each takes `stop_s`.
-    """
+    `begun` says when, and each takes `stop_s`."""
 
     def __init__(self, runs: Path, lasting: str | None = None) -> None:
         bound = socket.socket()

@@ -104,10 +104,8 @@ def ask(endpoints: dict[str, Any], **request: str) -> dict[str, Any]:
 
 
 def assert_safe(endpoints: dict[str, Any]) -> None:
-    """Laser off, vehicle stopped and braked, rail and arm at rest, by the world's truth.
-
-    The vehicle's bus has no answer to the brake's frame: who has sent it cannot know when the vehicle has read it.
-    """
+    """Laser off, vehicle stopped and braked, rail and arm at rest, by the world's truth. The vehicle's bus has no
+    answer to the brake's frame: who has sent it cannot know when the vehicle has read it."""
     until = time.monotonic() + BRAKE_FRAME_S
     while not (truth := ask(endpoints, op="truth")["truth"])["vehicle"]["braked"] and time.monotonic() < until:
         Clock().sleep(0.01)

@@ -70,10 +70,8 @@ def _direction(workplace: CommissionWorkplace, result: Result) -> None:
 
 
 def judge(rail: RailConfig, result: Result, told: float, moved: Vector) -> None:
-    """What the camera's way (3,) in its own axes says of a rail that was told to go `told`, both in m.
-
-    Raises `RefusedError` when it did not move.
-    """
+    """What the camera's way (3,) in its own axes says of a rail that was told to go `told`, both in m. Raises
+    `RefusedError` when it did not move."""
     way = float(np.linalg.norm(moved))
     if way < 0.05 * abs(told):
         raise RefusedError(

@@ -141,10 +141,8 @@ class Console:
 
     @contextmanager
     def computing(self, job: str) -> Iterator[Callable[[RunOutcome], None]]:
-        """Inside this context a job is done on the virtual clock; give its outcome to what this gives.
-
-        The page is told that it is being computed, and offers its motion when it is.
-        """
+        """Inside this context a job is done on the virtual clock; give its outcome to what this gives. The page is told
+        that it is being computed, and offers its motion when it is."""
         rehearsals = self.controller.rehearsals
         seed = None if self._cell.simulated is None else self._cell.simulated.facts["seed"]
         about = {"job": job, "seed": seed, "run": None}

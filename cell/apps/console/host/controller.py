@@ -44,10 +44,8 @@ class Questions:
         self._answered = threading.Event()
 
     def script(self, steps: tuple[str, ...], seen: Callable[[], bool] = lambda: True) -> Script:
-        """Asks about each refusal of a run of these steps, and waits; `hold` tells it the run once it is there.
-
-        Nobody is asked, and the refusal ends the run, when it is not `seen` by anybody then.
-        """
+        """Asks about each refusal of a run of these steps, and waits; `hold` tells it the run once it is there. Nobody
+        is asked, and the refusal ends the run, when it is not `seen` by anybody then."""
         self._run = None
         return Script(on_refusal=lambda name, failure: self._ask(name, failure, steps) if seen() else None)
 

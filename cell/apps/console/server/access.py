@@ -247,10 +247,8 @@ def _same(known: str, given: str) -> bool:
 
 
 class Holders:
-    """The clients by their ids, with their names, and the one that holds. Callable from any thread.
-
-    `lost` is called, with no lock held, whenever the one that held does so no more.
-    """
+    """The clients by their ids, with their names, and the one that holds. Callable from any thread. `lost` is called,
+    with no lock held, whenever the one that held does so no more."""
 
     def __init__(self, lost: Callable[[], None]) -> None:
         self._lost = lost

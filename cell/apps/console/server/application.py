@@ -119,10 +119,8 @@ class PageFiles(StaticFiles):
 
 
 class Application:
-    """The routes. `cell` is `/api/cell`'s answer, and `of_job` the same with another job's station.
-
-    `entered` is called whenever a link was used.
-    """
+    """The routes. `cell` is `/api/cell`'s answer, and `of_job` the same with another job's station. `entered` is called
+    whenever a link was used."""
 
     def __init__(
         self, access: Access, pages: Pages, archive: Archive, *, cell: Mapping[str, object], do: Ask,

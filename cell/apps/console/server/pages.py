@@ -33,9 +33,7 @@ MALFORMED, TOO_MANY, FULL = 1007, 1008, 1013
 
 class Mailbox:
     """What waits to be sent to one page: of what is shown only the newest, of the cloud every increment up to a bound.
-
-    A page that reads slowly sees less often, and holds nobody up. In the event loop's thread.
-    """
+    A page that reads slowly sees less often, and holds nobody up. In the event loop's thread."""
 
     def __init__(self) -> None:
         self._words: deque[str | bytes] = deque(maxlen=MOST_WORDS)

@@ -150,10 +150,8 @@ class Server:
             return f"the stop was not confirmed within {STOP_S:.0f} s: use the emergency stop"
 
     def _begin_stop(self) -> asyncio.Future[str | None]:
-        """The stop that answers one who asks now. All who ask while one has just begun have the next one in common.
-
-        One that lasts, because a device does not confirm it, holds up no other: two are under way at most.
-        """
+        """The stop that answers one who asks now. All who ask while one has just begun have the next one in common. One
+        that lasts, because a device does not confirm it, holds up no other: two are under way at most."""
         if self._next is None:
             self._next = self._loop.create_future()
             asked = self._next

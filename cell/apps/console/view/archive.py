@@ -85,10 +85,8 @@ _DRAW += "write_page(Path(sys.argv[1]), Path(sys.argv[2]))"
 
 
 class Archive:
-    """Below the folder `root`, of a cell whose calibration, in `calibrations`, may be `max_age_s` old.
-
-    What is not there is None.
-    """
+    """Below the folder `root`, of a cell whose calibration, in `calibrations`, may be `max_age_s` old. What is not
+    there is None."""
 
     def __init__(self, root: Path, calibrations: Path, max_age_s: float) -> None:
         self._root, self._calibrated = root, (str(calibrations), str(max_age_s))
@@ -166,10 +164,8 @@ class Archive:
             return printed.read() if done else None
 
     def replay(self, name: str) -> dict[str, object] | None:
-        """How the cell moved in a run; None for one whose record does not tell.
-
-        A record has tens of megabytes: it is read by a process of its own that gives way, and what it told is kept.
-        """
+        """How the cell moved in a run; None for one whose record does not tell. A record has tens of megabytes: it is
+        read by a process of its own that gives way, and what it told is kept."""
         folder = self._folder(name)
         if folder is None or below(self._root, folder.name, FILE) is None:
             return None

@@ -31,9 +31,7 @@ LENS = PARAMETERS[:9]
 @dataclass(frozen=True, eq=False)
 class Suspect:
     """A part that may have changed: how probable among the parts, and the most probable change (27,) of the chain.
-
-    `spread` (27, k) is a root of the change's covariance. Of another `round`: changed as well, not instead.
-    """
+    `spread` (27, k) is a root of the change's covariance. Of another `round`: changed as well, not instead."""
 
     chain: str
     part: str
@@ -119,10 +117,8 @@ def verdict(evidences: Mapping[str, DriftEvidence], states: Mapping[str, Adjustm
 def _all_suspects(
     evidences: Mapping[str, DriftEvidence], tests: list[tuple[str, Hypothesis]], threshold: float
 ) -> list[Suspect]:
-    """The suspects, and further ones for what the most probable change leaves unexplained beyond chance.
-
-    Parts that changed together are not rivals: one that does nothing to the place must not hide one that does.
-    """
+    """The suspects, and further ones for what the most probable change leaves unexplained beyond chance. Parts that
+    changed together are not rivals: one that does nothing to the place must not hide one that does."""
     made, left = list[Suspect](), dict(evidences)
     while True:
         found = np.array([evidence.log_factor(left[name], h, left[name].score[None])[0] for name, h in tests])
@@ -205,10 +201,8 @@ ROWS = 9
 
 
 def scan_effect(scan: ScanCalibration, stand_off: float, rail: tuple[float, float]) -> Callable[[Array], float]:
-    """Gives of a change (27,) of the calibration the RMS in m of how far it moves a sweep's points, flange frame.
-
-    Over the picture's rows, depths of ± 10 mm about `stand_off` m in front of the camera, and the rail from end to end.
-    """
+    """Gives of a change (27,) of the calibration the RMS in m of how far it moves a sweep's points, flange frame. Over
+    the picture's rows, depths of ± 10 mm about `stand_off` m in front of the camera, and the rail from end to end."""
     n, d = scan.light_plane.n, scan.light_plane.distance
     pixels = []
     for depth in DEPTHS:
@@ -272,9 +266,7 @@ class Change:
 @dataclass(frozen=True, eq=False)
 class Detectable:
     """The smallest `size` (m or rad, as its kind of change; infinite where nothing shows) that is found in `DETECTED`.
-
-    `step` (27,) is this change in its least visible direction, zero for an infinite size.
-    """
+    `step` (27,) is this change in its least visible direction, zero for an infinite size."""
 
     change: Change
     size: float

@@ -45,11 +45,8 @@ From the second one the rail moves far either way: it is aimed anew, and has no 
 
 @dataclass(frozen=True, eq=False)
 class KnownPicture:
-    """The calibration's own picture of a board, from where it is looked at again.
-
-    `base_from_flange` and `rail` (m) are as reported then, `camera_from_board` is where that picture alone has the
-    board.
-    """
+    """The calibration's own picture of a board, from where it is looked at again. `base_from_flange` and `rail` (m) are
+    as reported then, `camera_from_board` is where that picture alone has the board."""
 
     base_from_flange: pin.SE3
     rail: float
@@ -152,10 +149,8 @@ SWEEP_PICTURE_M = 5e-5
 
 @dataclass(frozen=True, eq=False)
 class PictureMeasurements:
-    """One picture's measurements; `rest` numbers the approach of the arm, `stop` that of the rail, each from 0.
-
-    A `sweeping` rail is one stop: where it was then is as sure as the camera's clock is read, `SWEEP_RAIL_M`.
-    """
+    """One picture's measurements; `rest` numbers the approach of the arm, `stop` that of the rail, each from 0. A
+    `sweeping` rail is one stop: where it was then is as sure as the camera's clock is read, `SWEEP_RAIL_M`."""
 
     data: ViewData
     rest: int
@@ -254,10 +249,8 @@ def dots_of(photo: ScanObservation) -> ViewData:
 
 
 def _misfit(rows: list[tuple[Array, Array]], columns: NDArray[np.intp], noise: Array | None = None) -> float:
-    """RMS of what is left of whitened residuals (n,) after the best fit of some parameters; NaN without rows.
-
-    `noise` (n, k) is what k further unknowns do to the residuals, each as large as its own standard deviation.
-    """
+    """RMS of what is left of whitened residuals (n,) after the best fit of some parameters; NaN without rows. `noise`
+    (n, k) is what k further unknowns do to the residuals, each as large as its own standard deviation."""
     if not rows:
         return float("nan")
     residual, jacobian = (np.concatenate(parts) for parts in zip(*rows, strict=True))
@@ -319,10 +312,8 @@ def log_factor(weighed: DriftEvidence, h: Hypothesis, scores: Array) -> Array:
 
 
 def quadratic(weighed: DriftEvidence, h: Hypothesis) -> tuple[Array, float]:
-    """The matrix A (k, k) and the number c for which ½ sᵀA s + c is that logarithm for the score s of `h.index`.
-
-    With the change's covariance P and its information F these are (P⁻¹ + F)⁻¹ and −½ log det(1 + F P).
-    """
+    """The matrix A (k, k) and the number c for which ½ sᵀA s + c is that logarithm for the score s of `h.index`. With
+    the change's covariance P and its information F these are (P⁻¹ + F)⁻¹ and −½ log det(1 + F P)."""
     index, size = list(h.index), np.array(h.size)
     information = weighed.information[np.ix_(index, index)] * size[:, None] * size
     posterior = np.eye(len(index)) + information

@@ -61,10 +61,8 @@ def rolled(plane: LightPlane, exit_point: Array, angle: float) -> LightPlane:
 
 
 def roll_of(moved: Array, by_roll: Array) -> Roll:
-    """From what the line has moved on rows (n,), rising, in px, and what a roll moves there, px per rad.
-
-    By the medians of the upper and the lower third: a speck on the plate moves some rows only.
-    """
+    """From what the line has moved on rows (n,), rising, in px, and what a roll moves there, px per rad. By the medians
+    of the upper and the lower third: a speck on the plate moves some rows only."""
     third = max(1, len(moved) // 3)
     ends = slice(None, third), slice(-third, None)
     (high, low), (high_gain, low_gain) = ([float(np.median(v[end])) for end in ends] for v in (moved, by_roll))

@@ -167,10 +167,8 @@ _STEP = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class WitnessCheck:
-    """How far the light plane has turned as the `plate` and as the `board` show it, about the laser's exit.
-
-    `wrong` (27,) is what the scan chain of a job is off by that believes the plate.
-    """
+    """How far the light plane has turned as the `plate` and as the `board` show it, about the laser's exit. `wrong`
+    (27,) is what the scan chain of a job is off by that believes the plate."""
 
     plate: Pointing
     board: Pointing
@@ -250,10 +248,8 @@ class HeadShift:
 
     @classmethod
     def of(cls, state: AdjustmentState, reference: Reference, looks: Sequence[PictureMeasurements]) -> Self:
-        """From pictures of the board, each from a rest of its own in `INTERIM_VIEW`, beside the calibrated `state`.
-
-        A head that slipped is shifted or turned, seldom both, so each is held against chance by itself.
-        """
+        """From pictures of the board, each from a rest of its own in `INTERIM_VIEW`, beside the calibrated `state`. A
+        head that slipped is shifted or turned, seldom both, so each is held against chance by itself."""
         weighed = evidence(state, reference, looks, INTERIM_VIEW)
         hand = np.eye(SHARED)[:, HAND]
         change, covariance = weighed.change(hand)

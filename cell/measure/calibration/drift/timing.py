@@ -141,10 +141,8 @@ class TimedSweep:
 def find_shutter(
     scan: ScanCalibration, base_from_flange: pin.SE3, sweeps: Sequence[TimedSweep], link: dict[str, str]
 ) -> Shutter:
-    """From sweeps to and fro, the arm standing at `base_from_flange`, camera and rail set up as `link` says.
-
-    Raises `RefusedError` where the sweeps do not tell; whether the shutter will do is for `refuse_rolling` to say.
-    """
+    """From sweeps to and fro, the arm standing at `base_from_flange`, camera and rail set up as `link` says. Raises
+    `RefusedError` where the sweeps do not tell; whether the shutter will do is for `refuse_rolling` to say."""
     _require_frames(sweeps)
     _, slopes, _ = _displacements(scan, base_from_flange, sweeps)
     readout, sigma = _readout(slopes, sweeps)
@@ -157,10 +155,8 @@ def find_shutter(
 
 
 def roughly_late(scan: ScanCalibration, base_from_flange: pin.SE3, sweeps: Sequence[TimedSweep]) -> tuple[float, float]:
-    """How late the stamps come, s, and its deviation, from sweeps at one speed, to and fro.
-
-    One speed does not tell lateness from the play of a screw: what a usual one makes of it is in the deviation.
-    """
+    """How late the stamps come, s, and its deviation, from sweeps at one speed, to and fro. One speed does not tell
+    lateness from the play of a screw: what a usual one makes of it is in the deviation."""
     _require_frames(sweeps)
     shifts, _, _ = _displacements(scan, base_from_flange, sweeps)
     velocities = np.array([sweep.velocity for sweep in sweeps for _ in sweep.frames])

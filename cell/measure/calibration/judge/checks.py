@@ -101,9 +101,7 @@ def camera_checks(
     found: Intrinsics, views: Sequence[BoardView], names: Sequence[str], *, given: bool = False
 ) -> list[QualityCheck]:
     """Checks of a camera from pictures: how well it is known, how it fits, what is systematic in what is left over.
-
-    `names` are those of the views.
-    """
+    `names` are those of the views."""
     camera = found.camera
     width = max(camera.width, camera.height)
     off, board = _residuals(views, camera)

@@ -37,10 +37,8 @@ OWN_FIGURES = 3
 
 
 def refuse_exchanged(names: Sequence[str], flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> None:
-    """Refuse views whose pictures belong to other flange poses; `boards` are camera_from_board by picture.
-
-    Whatever the hand-eye, the flange turns between two views by the angle by which the board seems to turn.
-    """
+    """Refuse views whose pictures belong to other flange poses; `boards` are camera_from_board by picture. Whatever the
+    hand-eye, the flange turns between two views by the angle by which the board seems to turn."""
     count = len(flanges)
     apart = np.array([[[_apart(flanges, boards, i, p=p, j=j, q=j) for j in range(count)] for p in range(count)]
                       for i in range(count)])  # fmt: skip
@@ -83,10 +81,8 @@ def _apart(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3], i: int, p: int
 
 
 def refuse_bent(board: str, adjusted: Adjusted, views: Sequence[ViewData]) -> None:
-    """Refuse a board that is bent or twisted: dots out of its plane like a second-degree surface.
-
-    Every view has a pose of its own here and the lens is free, so that arm, rail and mount play no part.
-    """
+    """Refuse a board that is bent or twisted: dots out of its plane like a second-degree surface. Every view has a pose
+    of its own here and the lens is free, so that arm, rail and mount play no part."""
     state = adjusted.state
     whole = max((v.points for v in views), key=len)
     middle = 0.5 * (whole.min(axis=0) + whole.max(axis=0))
@@ -225,9 +221,7 @@ UNTOLD = 1e-9
 
 def foreign_view(found: Intrinsics, views: Sequence[BoardView]) -> tuple[int, float] | None:
     """Which of the views is of another camera than the others, and its F; None where none is, or it cannot be told.
-
-    `found` is the camera of all `views`, which are of different stops.
-    """
+    `found` is the camera of all `views`, which are of different stops."""
     if len(views) <= LEAST_OTHERS:
         return None
     # With the foreign one among them the views may have chosen too plain a lens.

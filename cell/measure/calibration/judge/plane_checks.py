@@ -54,10 +54,8 @@ def crooked(camera: CameraModel, pixels: Array, sigma: Array) -> str | None:
 
 
 def odd_stripes(clouds: Sequence[Array]) -> dict[int, str]:
-    """Which frames' stripe points (n, 3) in the camera frame, in m, are of another line of light than most; why.
-
-    The plane is that of the pair of frames to which most others are nearest, so that a third of them may be wrong.
-    """
+    """Which frames' stripe points (n, 3) in the camera frame, in m, are of another line of light than most; why. The
+    plane is that of the pair of frames to which most others are nearest, so that a third of them may be wrong."""
     lit = [k for k, cloud in enumerate(clouds) if len(cloud) >= LEAST_STRIPES]
     if len(lit) < LEAST_STRIPES + 1:
         return {}
@@ -102,10 +100,8 @@ class PlaneKnown:
     def of(
         cls, plane: LightPlane, others: Sequence[LightPlane], cloud: Array, moved: Sequence[LightPlane] = ()
     ) -> Self:
-        """`others` (n) lack one frame each; `moved` are as `planes_of_cameras` gives them.
-
-        `cloud` (m, 3) in m is where the plane was seen.
-        """
+        """`others` (n) lack one frame each; `moved` are as `planes_of_cameras` gives them. `cloud` (m, 3) in m is where
+        the plane was seen."""
         count = max(len(others), 1)
         thin = cloud[:: max(1, len(cloud) // 500)]
 
@@ -163,9 +159,7 @@ def plane_checks(
     rms: float, own: float, cloud: Array, frames: int, known: PlaneKnown, left_out: int = 0
 ) -> list[QualityCheck]:
     """Checks of a plane from its points' RMS (m), the stripe's own σ (m), the points (n, 3), and how it scatters.
-
-    `left_out` stripes, beside those of the `frames`, are of no line in it.
-    """
+    `left_out` stripes, beside those of the `frames`, are of no line in it."""
     reach = float(np.median(cloud[:, 2]))
     words = f"from {frames} frames, each left out in turn; take further frames at other distances and tilts"
     checks = [plane_fit_check(rms, own, cloud)]
@@ -192,10 +186,8 @@ def plane_checks(
 
 @dataclass(frozen=True, eq=False)
 class Flatness:
-    """Distances in m of stripe points from one plane: RMS, 95th percentile, number of points, RMS per frame.
-
-    `extent` (2,) in m along the two main directions of the points in that plane.
-    """
+    """Distances in m of stripe points from one plane: RMS, 95th percentile, number of points, RMS per frame. `extent`
+    (2,) in m along the two main directions of the points in that plane."""
 
     rms: float
     p95: float

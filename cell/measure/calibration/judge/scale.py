@@ -48,10 +48,8 @@ class Scale:
 
     @property
     def believed(self) -> bool:
-        """True when the arm and the board's name do not agree, and a scale makes most of what they differ by.
-
-        What that moves is not known better. A scale that explains little is picked up from something else.
-        """
+        """True when the arm and the board's name do not agree, and a scale makes most of what they differ by. What that
+        moves is not known better. A scale that explains little is picked up from something else."""
         return abs(self.value - 1) > DOUBT_SIGMAS * self.sigma and self.explained > EXPLAINS
 
     @property
@@ -119,10 +117,8 @@ LEAST_REFUSED = 4e-3
 
 @dataclass(frozen=True, eq=False)
 class BoardSize:
-    """By what `share` the board, "fine" or "large", of `pitch` in m as named, seems larger than its name says.
-
-    `sigma` is one standard deviation of it, `moved` (27,) what the shared parameters would move if its size were free.
-    """
+    """By what `share` the board, "fine" or "large", of `pitch` in m as named, seems larger than its name says. `sigma`
+    is one standard deviation of it, `moved` (27,) what the shared parameters would move if its size were free."""
 
     board: str
     pitch: float

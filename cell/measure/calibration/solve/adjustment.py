@@ -121,10 +121,8 @@ class Adjustment:
         self.priors = priors
 
     def solve(self, start: AdjustmentState, variance_rounds: int = VARIANCE_ROUNDS, settled: float = 1e-9) -> Adjusted:
-        """Levenberg–Marquardt, then variance components, alternating until the noise agrees with the residuals.
-
-        At the end a step that promises less than the share `settled` of the cost is not taken any more.
-        """
+        """Levenberg–Marquardt, then variance components, alternating until the noise agrees with the residuals. At the
+        end a step that promises less than the share `settled` of the cost is not taken any more."""
         state = replace(
             start, flanges=[v.base_from_flange for v in self.views], rails=np.array([v.rail for v in self.views])
         )
@@ -368,10 +366,8 @@ def _reduced(adjustment: Adjustment, k: int, state: AdjustmentState) -> tuple[Ar
 
 
 def predicted(view: ViewData, flange: pin.SE3, other: AdjustmentState) -> list[float]:
-    """RMS px at the best pose, stripe and board in m at the reported pose, and the sum of squares in px².
-
-    By a calibration that has not seen the view; `flange` is about where the view itself puts the flange.
-    """
+    """RMS px at the best pose, stripe and board in m at the reported pose, and the sum of squares in px². By a
+    calibration that has not seen the view; `flange` is about where the view itself puts the flange."""
     if not np.isfinite(other.camera.parameters).all() or other.camera.fx <= 0 or other.camera.fy <= 0:
         return [np.inf, np.inf, np.inf, np.inf]
     dots, stripe, board, squares = np.nan, np.nan, np.nan, 0.0

@@ -95,10 +95,8 @@ FLAT = Bow(0.0, 0.0, np.zeros(SHARED))
 
 
 def with_bow(problem: Adjustment, flat: Adjusted) -> Adjusted:
-    """The adjustment with its bow, if the stripes show one; otherwise `flat` itself.
-
-    The covariance is then that of the shared parameters with the bow unknown beside them.
-    """
+    """The adjustment with its bow, if the stripes show one; otherwise `flat` itself. The covariance is then that of the
+    shared parameters with the bow unknown beside them."""
     if flat.state.plane is None:
         return flat
     found = flat

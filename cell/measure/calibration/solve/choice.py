@@ -198,9 +198,7 @@ def _bent(solution: Solution, pictures: Intrinsics) -> bool:
 
 def _arm_scatter(views: Sequence[ViewData], held: Mask, staged: Staged) -> tuple[float, float]:
     """The arm's scatter (m, rad) per axis by variance components, with the pictures' camera and without the stripe.
-
-    What the pictures' own poses scatter is part of it: it cannot be told apart.
-    """
+    What the pictures' own poses scatter is part of it: it cannot be told apart."""
     dark = [replace(v, stripe=np.zeros((0, 2)), stripe_sigma=np.zeros(0)) for v in views]
     free = held.copy()
     free[PLANE] = False

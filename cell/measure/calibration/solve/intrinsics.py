@@ -147,10 +147,8 @@ def choose_lens(views: Sequence[BoardView]) -> tuple[Intrinsics, Intrinsics]:
 
 
 def given_camera(camera: CameraModel, views: Sequence[BoardView]) -> Intrinsics:
-    """A camera that is known, with the views' residuals in it; its own deviation is not known here.
-
-    Raises RefusedError without views.
-    """
+    """A camera that is known, with the views' residuals in it; its own deviation is not known here. Raises RefusedError
+    without views."""
     if not views:
         raise RefusedError("no picture shows the board, and a given camera needs one to be used: see why, by picture")
     rms = np.array([board_pose(view, camera).rms_px for view in views])
@@ -334,10 +332,8 @@ def _normal(
 
 
 def moved_by_bend(adjustment: Adjustment, state: AdjustmentState) -> Array:
-    """What the shared parameters (27,) would move if the board might be bent, at a solution with the arm's poses.
-
-    One step from there, with what is free in the adjustment and the three shapes; what is held does not move.
-    """
+    """What the shared parameters (27,) would move if the board might be bent, at a solution with the arm's poses. One
+    step from there, with what is free in the adjustment and the three shapes; what is held does not move."""
     free = np.flatnonzero(adjustment.free)
     information, gradient = _lens_prior(adjustment, state, free)
     for k in range(len(adjustment.views)):
@@ -362,10 +358,8 @@ def _lens_prior(adjustment: Adjustment, state: AdjustmentState, free: NDArray[np
 
 
 def _bent_rows(adjustment: Adjustment, k: int, state: AdjustmentState, free: NDArray[np.intp], *, arm: bool) -> Array:
-    """Rows of view `k`: the `free` parameters, the three shapes, the residual; its own pose is eliminated.
-
-    With `arm` the reported flange pose counts.
-    """
+    """Rows of view `k`: the `free` parameters, the three shapes, the residual; its own pose is eliminated. With `arm`
+    the reported flange pose counts."""
     _, middle, half = _whole(adjustment)
     parts = [(name, rows, right) for name, rows, right, _ in adjustment.rows_of(k, state)]
     if arm:

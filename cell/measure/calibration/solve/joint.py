@@ -43,11 +43,8 @@ class Staged:
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """Staged and joint solution, the data they were made of, and how well held-out views are predicted.
-
-    `free` (27,) says which shared parameters moved; `size` how large the arm's ways say that the board is, where that
-    was asked.
-    """
+    """Staged and joint solution, the data they were made of, and how well held-out views are predicted. `free` (27,)
+    says which shared parameters moved; `size` how large the arm's ways say that the board is, where that was asked."""
 
     staged: Staged
     adjusted: Adjusted
@@ -62,10 +59,8 @@ def solve_staged(
     observations: Sequence[ScanObservation], nominal: CameraModel | None = None, rail_direction: Array | None = None,
     stripe: bool = True, camera: CameraModel | None = None,
 ) -> Staged:  # fmt: skip
-    """Camera, then hand-eye, then light plane, each from the result before. All observations need a view.
-
-    A `camera` that is known already is not estimated again.
-    """
+    """Camera, then hand-eye, then light plane, each from the result before. All observations need a view. A `camera`
+    that is known already is not estimated again."""
     every, observations = observations, [o for o in observations if not o.same_rest]
     views = [o.view for o in observations if o.view is not None]
     if camera is None:

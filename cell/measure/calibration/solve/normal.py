@@ -109,10 +109,8 @@ def dots_block(state: AdjustmentState, view: ViewData, flange: pin.SE3, rail: fl
 
 
 def stripe_block(state: AdjustmentState, view: ViewData, flange: pin.SE3, rail: float) -> tuple[Array, Array, Array]:
-    """Negative distance (m,) of the stripe points from the board's plane, derivative of the distance, σ (m,).
-
-    All in m. The sign makes the block like that of the dots, where the residual is measured minus predicted.
-    """
+    """Negative distance (m,) of the stripe points from the board's plane, derivative of the distance, σ (m,). All in m.
+    The sign makes the block like that of the dots, where the residual is measured minus predicted."""
     assert state.plane is not None
     camera, plane, hand, board = state.camera, state.plane, state.flange_from_camera, state.base_from_board
     rays, ray_by_pixel = camera.rays_with_jacobian(view.stripe)
@@ -182,9 +180,7 @@ class Normal:
 
     def __init__(self, rests: NDArray[np.intp], free: NDArray[np.bool_], own_free: NDArray[np.bool_]) -> None:
         """`rests` (views,) numbers the rest of the arm in which each view was taken; free ones of (27,) and (7,) move.
-
-        Views of one rest have one flange pose in common; each has a rail position of its own.
-        """
+        Views of one rest have one flange pose in common; each has a rail position of its own."""
         views = len(rests)
         self.groups = {
             name: Block(np.zeros((SHARED, SHARED)), np.zeros((views, SHARED, OWN)), np.zeros((views, OWN, OWN)))

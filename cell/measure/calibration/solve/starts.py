@@ -26,9 +26,7 @@ LEAST_VIEWS = 3
 
 def zhang(views: Sequence[BoardView], nominal: CameraModel | None = None, lens: bool = True) -> CameraModel:
     """Camera of several views of a board; `nominal` is a start where it is known. Without `lens` it has no distortion.
-
-    Raises RefusedError for fewer than three views, or none that tell the focal length.
-    """
+    Raises RefusedError for fewer than three views, or none that tell the focal length."""
     if len(views) < LEAST_VIEWS:
         raise RefusedError(
             f"{len(views)} views of the board; a camera's calibration needs {LEAST_VIEWS} or more from different sides"
@@ -81,10 +79,8 @@ def plane_from_board(
     views: Sequence[BoardView],
     profiles: Sequence[StripeProfile | None],
 ) -> PlaneStart:
-    """All stripe points on the boards' planes in the camera frame, and their plane.
-
-    Frames whose stripe misses the board give no rows. Raises RefusedError when all points lie on one line.
-    """
+    """All stripe points on the boards' planes in the camera frame, and their plane. Frames whose stripe misses the
+    board give no rows. Raises RefusedError when all points lie on one line."""
     rows, points = [], []
     for pose, view, profile in zip(camera_from_board, views, profiles, strict=True):
         if profile is None:
@@ -127,9 +123,7 @@ def stripe_pixels(profile: StripeProfile, rows: NDArray[np.intp]) -> Array:
 
 def stripe_means(profile: StripeProfile, rows: NDArray[np.intp], count: int) -> tuple[Array, Array]:
     """Pixels (m, 2) and σ (m,) of about `count` to twice as many means of neighbouring rows (n,), weighted by their σ.
-
-    Over so few rows a stripe on a plane is straight, and the mean of points of a line is on the line.
-    """
+    Over so few rows a stripe on a plane is straight, and the mean of points of a line is on the line."""
     bins = rows // max(1, len(rows) // count)
     weight = 1 / profile.sigma[rows] ** 2
     _, member = np.unique(bins, return_inverse=True)
@@ -149,9 +143,7 @@ LEAST_SPREAD = 0.02
 @dataclass(frozen=True, eq=False)
 class Crossing:
     """Where the stripe crosses one row (or column) of the board: `place` (2,) in the ideal picture at unit distance.
-
-    `dots` (k,) are the row's points in the view, `axis` the board axis (0: x, 1: y) along which the row runs.
-    """
+    `dots` (k,) are the row's points in the view, `axis` the board axis (0: x, 1: y) along which the row runs."""
 
     place: Array
     dots: NDArray[np.intp]
@@ -262,9 +254,7 @@ LEAST_AXES_SINE = 0.05
 @dataclass(frozen=True, eq=False)
 class HandEye:
     """flange_from_camera (at rail position 0), the rail's travel per metre of reading (3,) in camera axes, the board.
-
-    `scatter_m` and `scatter_rad`: RMS, over the views, of how far the board of one view lies from `base_from_board`.
-    """
+    `scatter_m` and `scatter_rad`: RMS, over the views, of how far the board of one view lies from `base_from_board`."""
 
     flange_from_camera: pin.SE3
     rail_direction: Array
@@ -274,10 +264,8 @@ class HandEye:
 
 
 def park_martin(base_from_flange: Sequence[pin.SE3], camera_from_board: Sequence[pin.SE3]) -> Array:
-    """Rotation (3, 3) flange_from_camera from pairs of poses, from the rotation vectors of all relative motions.
-
-    Raises RefusedError when the flange was not turned about two different axes.
-    """
+    """Rotation (3, 3) flange_from_camera from pairs of poses, from the rotation vectors of all relative motions. Raises
+    RefusedError when the flange was not turned about two different axes."""
     moment = np.zeros((3, 3))
     axes = []
     for i, j in combinations(range(len(base_from_flange)), 2):
@@ -302,10 +290,8 @@ def solve_hand_eye(
     rail: Sequence[float] | None = None,
     nominal_direction: Array | None = None,
 ) -> HandEye:
-    """Hand-eye of a camera on the flange that sees a board at rest, from pairs of poses.
-
-    With rail readings in m that differ, the rail's direction and scale are solved too; else `nominal_direction` holds.
-    """
+    """Hand-eye of a camera on the flange that sees a board at rest, from pairs of poses. With rail readings in m that
+    differ, the rail's direction and scale are solved too; else `nominal_direction` holds."""
     rotation = park_martin(base_from_flange, camera_from_board)
     readings = np.zeros(len(base_from_flange)) if rail is None else np.asarray(rail, dtype=np.float64)
     with_rail = np.ptp(readings) > 1e-3

@@ -110,9 +110,7 @@ def surface_motion(
     first: Cloud, second: Cloud, nominal: NominalSurface, pose: pin.SE3, by_poses: tuple[Motions, Motions]
 ) -> SurfaceMotion:
     """Between two scans of the same strip of the `nominal` surface; in the first it lay at `pose` (base_from_surface).
-
-    `by_poses` is how the points of each scan move by one standard deviation of what the arm's poses are off by.
-    """
+    `by_poses` is how the points of each scan move by one standard deviation of what the arm's poses are off by."""
     before = _Beside.of(first, nominal, pose, by_poses[0])
     tree = scipy.spatial.cKDTree(before.feet)
     seen = _compared(before, tree, _Beside.of(second, nominal, pose, by_poses[1]), nominal.radius)
@@ -227,10 +225,8 @@ class Creep:
 
     @classmethod
     def of(cls, moved: SurfaceMotion, unsure: Array, origin: Array, since: float, until: float) -> "Creep | None":
-        """From a motion between two sweeps, their middles at `since` and `until`, s; None where none shows.
-
-        `unsure` (6, 6) is what the sweeps' times leave open of the motion.
-        """
+        """From a motion between two sweeps, their middles at `since` and `until`, s; None where none shows. `unsure`
+        (6, 6) is what the sweeps' times leave open of the motion."""
         seconds, covariance, motion = until - since, moved.scatter + unsure + FLOOR, moved.motion
         shown = float(motion @ np.linalg.solve(covariance, motion))
         if seconds <= 0 or shown < CREEP_EVIDENCE or np.linalg.norm(motion[:3]) < LEAST_CREEP_M:

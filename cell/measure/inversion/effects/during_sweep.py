@@ -46,10 +46,8 @@ LARGEST_RAD = 0.4e-3
 
 @dataclass(frozen=True)
 class Rocking:
-    """How the vehicle rocked: `hz`, and `height` in m by which the scanned surface seemed to go up and down.
-
-    Waves of the length `wave`, m, on the surface itself would look the same.
-    """
+    """How the vehicle rocked: `hz`, and `height` in m by which the scanned surface seemed to go up and down. Waves of
+    the length `wave`, m, on the surface itself would look the same."""
 
     hz: float
     height: float
@@ -57,10 +55,8 @@ class Rocking:
 
 
 def find_rocking(cloud: Cloud, nominal: NominalSurface, base_from_surface: pin.SE3, times: Array) -> Rocking | None:
-    """The rocking that a scan's lines, taken at `times` (lines,) in s, show at the pose found; None without any.
-
-    None as well where the lines go up and down with overtones: a vehicle on its springs has none, ridges have.
-    """
+    """The rocking that a scan's lines, taken at `times` (lines,) in s, show at the pose found; None without any. None
+    as well where the lines go up and down with overtones: a vehicle on its springs has none, ridges have."""
     scan = Scan.of(cloud, max(10_000, POINTS * cloud.shape[0]))
     rows = correspondences(base_from_surface, scan, nominal, GATE_M)
     of = scan.lines[rows.index]
@@ -182,10 +178,8 @@ def rocking_covariance(rocking: Rocking | None, base_from_vehicle: pin.SE3, at: 
 
 
 def roll_of(swung: float, base_from_board: pin.SE3, base_from_vehicle: pin.SE3) -> float:
-    """The roll, rad, of a vehicle that moves a board to and fro by `swung` m before a camera that looks square at it.
-
-    A pitch moves such a board mostly along the camera's axis; the heights of a scan show it instead.
-    """
+    """The roll, rad, of a vehicle that moves a board to and fro by `swung` m before a camera that looks square at it. A
+    pitch moves such a board mostly along the camera's axis; the heights of a scan show it instead."""
     moved = np.cross(base_from_vehicle.rotation[:, 0], base_from_board.translation - base_from_vehicle.translation)
     seen = base_from_board.rotation[:, :2].T @ moved
     return swung / max(float(np.linalg.norm(seen)), LEAST_LEVER_M) if swung else 0.0

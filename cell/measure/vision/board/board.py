@@ -53,10 +53,8 @@ class BoardPose:
 
 
 def find_board(image: Image, spec: BoardSpec) -> BoardView:
-    """The points of a board in an 8-bit grey image (h, w), to sub-pixel accuracy.
-
-    Raises PictureRefused with the reason: black, saturated, no board, ambiguous order, mirrored.
-    """
+    """The points of a board in an 8-bit grey image (h, w), to sub-pixel accuracy. Raises PictureRefused with the
+    reason: black, saturated, no board, ambiguous order, mirrored."""
     if image.ndim != 2 or image.dtype != np.uint8:
         raise ValueError(f"the board needs a grey 8-bit image, not {image.dtype} of shape {image.shape}")
     check_picture(image)
@@ -79,9 +77,7 @@ def _find_dots(image: Image, spec: BoardSpec) -> BoardView:
 
 def board_pose(view: BoardView, camera: CameraModel) -> BoardPose:
     """Pose of the board of a view: robust least squares on the pixels, each point with its own σ; dots as circles.
-
-    Raises PictureRefused when two poses explain the picture about equally well, or none does.
-    """
+    Raises PictureRefused when two poses explain the picture about equally well, or none does."""
     if view.size != (camera.width, camera.height):
         raise PictureRefused(
             Reason.WRONG_SIZE,
@@ -121,10 +117,8 @@ def predict(camera: CameraModel, camera_from_board: pin.SE3, points: Array, dot_
 
 
 def _starts(view: BoardView, camera: CameraModel) -> list[pin.SE3]:
-    """The one or two poses that a flat board allows in closed form.
-
-    A lens that is not known yet may have no rays for the outermost points: the others do for a start.
-    """
+    """The one or two poses that a flat board allows in closed form. A lens that is not known yet may have no rays for
+    the outermost points: the others do for a start."""
     ideal = camera.normalised(view.pixels)
     known = np.flatnonzero(np.isfinite(ideal).all(axis=1))
     if len(known) < max(LEAST_POINTS, len(ideal) / 2):
@@ -155,10 +149,8 @@ class _PoseFit:
 
     @property
     def scale(self) -> float:
-        """By how much the points depart more from the pose than their σ say; at least 1.
-
-        Less is not believed: an error that all points share shows in no residual.
-        """
+        """By how much the points depart more from the pose than their σ say; at least 1. Less is not believed: an error
+        that all points share shows in no residual."""
         squares = float(self.weights @ np.square(self.whitened).sum(axis=1))
         freedom = max(1.0, 2 * float(self.weights.sum()) - 6)
         return float(np.sqrt(max(1.0, squares / freedom)))
@@ -220,10 +212,8 @@ def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3, weights: Array
 
 
 def without_outliers(view: BoardView) -> BoardView:
-    """The view without the points that a laser line, a glint or a finger moved: the others say where they should lie.
-
-    A flat board is seen through a homography and a smooth lens; what departs from both is dropped.
-    """
+    """The view without the points that a laser line, a glint or a finger moved: the others say where they should lie. A
+    flat board is seen through a homography and a smooth lens; what departs from both is dropped."""
     flat = view.object_points[:, :2] / view.spec.pitch
     terms = 10 if len(flat) >= LENS_POINTS else 6 if len(flat) >= 20 else 3
     homography, _ = cv2.findHomography(flat, view.pixels, cv2.RANSAC, 3.0)

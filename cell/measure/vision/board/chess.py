@@ -267,10 +267,8 @@ def _crossings(smooth: NDArray[np.float32], places: Array) -> tuple[NDArray[np.b
 
 
 def corner_lattices(corners: Corners, least: int) -> Iterator[tuple[NDArray[np.intp], Places]]:
-    """Lattices of at least `least` corners, none sharing a corner: indices (m,) and places (m, 2).
-
-    Neighbours have their dark sectors at right angles to each other. Places are right-handed as the picture is.
-    """
+    """Lattices of at least `least` corners, none sharing a corner: indices (m,) and places (m, 2). Neighbours have
+    their dark sectors at right angles to each other. Places are right-handed as the picture is."""
     n = len(corners.places)
     if n < least:
         return

@@ -197,9 +197,7 @@ def _deviation(
     p: Array, du: Array, dv: Array, grey: Array, used: NDArray[np.bool_], limit: float
 ) -> float:  # pragma: no cover
     """One standard deviation of the corner's coordinates in px: that of an M-estimator whose pixels differ in noise.
-
-    `used` are the pixels (n,) that count, those beyond `limit` DN do not.
-    """
+    `used` are the pixels (n,) that count, those beyond `limit` DN do not."""
     slope = np.zeros((PARAMETERS, PARAMETERS))
     spread = np.zeros((PARAMETERS, PARAMETERS))
     row = np.empty(PARAMETERS)

@@ -205,10 +205,8 @@ def _measured(image: Image, start: Blobs, rounds: int) -> tuple[Blobs, Array, Ar
 
 
 def _ring_scores(signs: Array) -> Array:
-    """Two signs of a ring (n, 2): brightness of the middle between dot (0) and board (1), and missing darkness.
-
-    The second, the dot's whole darkness against the median of all dots, survives blur: a ring lacks a quarter of it.
-    """
+    """Two signs of a ring (n, 2): brightness of the middle between dot (0) and board (1), and missing darkness. The
+    second, the dot's whole darkness against the median of all dots, survives blur: a ring lacks a quarter of it."""
     middle, rim, bright, darkness = signs.T
     missing = 1 - darkness / max(float(np.median(darkness)), 1e-9)
     return np.column_stack([(middle - rim) / np.maximum(bright - rim, 1.0), missing])

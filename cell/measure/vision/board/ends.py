@@ -32,10 +32,8 @@ MARGIN_SHORT = 0.25
 
 
 def check_dot_ends(image: Image, spec: BoardSpec, plane: PlaneMap, found: NDArray[np.intp], radius: float) -> None:
-    """Refuse unless the dots `found` (ids) reach the board's edges and no dot follows; `radius` in pitches.
-
-    A marked board's order comes from its rings: for it, only what contradicts is refused.
-    """
+    """Refuse unless the dots `found` (ids) reach the board's edges and no dot follows; `radius` in pitches. A marked
+    board's order comes from its rings: for it, only what contradicts is refused."""
     smooth = smoothed(image)
     lattice = spec.lattice()
     marked = spec.kind == "marked_dots"
@@ -142,10 +140,8 @@ def check_hidden_sides(smooth: Image, spec: BoardSpec, plane: PlaneMap, found: N
 
 
 def check_chess_ends(image: Image, spec: BoardSpec, plane: PlaneMap) -> None:
-    """Refuse unless the pattern of squares stops one square beyond the outermost corners, on every side.
-
-    The outermost squares may be narrower than the others, and the white margin beyond them as narrow as it likes.
-    """
+    """Refuse unless the pattern of squares stops one square beyond the outermost corners, on every side. The outermost
+    squares may be narrower than the others, and the white margin beyond them as narrow as it likes."""
     smooth = np.asarray(cv2.GaussianBlur(image, (5, 5), 0), dtype=np.uint8)
     cols, rows = spec.grid
     for name, start, along, out, count in (

@@ -56,10 +56,8 @@ class Blobs:
 
 
 def dot_lattices(blobs: Blobs, least: int) -> Iterator[tuple[NDArray[np.intp], Places]]:
-    """Lattices of at least `least` blobs, none sharing a blob: indices (m,) and places (m, 2).
-
-    Right-handed as the picture is: the second step lies clockwise of the first, as y does of x.
-    """
+    """Lattices of at least `least` blobs, none sharing a blob: indices (m,) and places (m, 2). Right-handed as the
+    picture is: the second step lies clockwise of the first, as y does of x."""
     n = len(blobs.centres)
     if n < least:
         return
@@ -133,10 +131,8 @@ def grow(
     centres: Array, tree: scipy.spatial.cKDTree, seed: int, basis: tuple[Array, Array],
     alike: Callable[[int, int], bool],
 ) -> dict[tuple[int, int], int]:  # fmt: skip
-    """Place → point, from the seed outwards; each hands its own local steps to its neighbours.
-
-    `alike(a, b)` says whether b can be a neighbour of a.
-    """
+    """Place → point, from the seed outwards; each hands its own local steps to its neighbours. `alike(a, b)` says
+    whether b can be a neighbour of a."""
     found = {(0, 0): seed}
     points: list[tuple[float, float]] = centres.tolist()
     steps = {seed: [(float(basis[0][0]), float(basis[0][1])), (float(basis[1][0]), float(basis[1][1]))]}
@@ -215,11 +211,8 @@ class PlaneMap:
 
 
 def identify(spec: BoardSpec, places: Places, ring_scores: Array) -> tuple[Places, bool]:
-    """Board places (n, 2) of lattice places (n, 2), and whether the order rests on an assumption.
-
-    `ring_scores` (n, 2) are the signs of rings. Entries that do not belong to the board get
-    (−1, −1). Raises PictureRefused.
-    """
+    """Board places (n, 2) of lattice places (n, 2), and whether the order rests on an assumption. `ring_scores` (n, 2)
+    are the signs of rings. Entries that do not belong to the board get (−1, −1). Raises PictureRefused."""
     if spec.kind != "marked_dots":
         # Of a symmetric board the order whose rows run most nearly along the first step.
         orders = by_outline(spec, places)

@@ -108,10 +108,8 @@ def _variants(image: Image) -> Iterator[Image]:
 
 
 def _layout_of(spec: BoardSpec, legacy: bool) -> Array:
-    """Corners (n, 4, 2) of the markers in pitches from the first inner corner, in their reading order.
-
-    The older layout of boards with an even number of rows begins with a marker, the present one with a black square.
-    """
+    """Corners (n, 4, 2) of the markers in pitches from the first inner corner, in their reading order. The older layout
+    of boards with an even number of rows begins with a marker, the present one with a black square."""
     j, i = np.divmod(np.arange(spec.cols * spec.rows), spec.cols)
     holds = (i + j) % 2 == (0 if legacy else 1)
     middle = np.column_stack([i[holds], j[holds]]) - 0.5
@@ -263,10 +261,8 @@ def _instead(image: Image, spec: BoardSpec) -> str:
 
 
 def _layout(spec: BoardSpec, corners: Array, tags: NDArray[np.intp], up: int, turn: int) -> _Layout:
-    """Points of tags that are numbered from the last row upwards (`up`) or downwards, read from another corner.
-
-    Squares that touch a tag's corners draw the corners first read inwards: the tags' middles count.
-    """
+    """Points of tags that are numbered from the last row upwards (`up`) or downwards, read from another corner. Squares
+    that touch a tag's corners draw the corners first read inwards: the tags' middles count."""
     row, column = np.divmod(tags, spec.cols)
     place = (spec.rows - 1 - row if up else row) * spec.cols + column
     ids = (4 * place[:, None] + (np.arange(4) + turn) % 4).astype(np.intp)

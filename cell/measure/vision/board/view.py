@@ -73,10 +73,8 @@ class BoardSpec:
         return (self.cols - 1, self.rows - 1) if self.kind == "charuco" else (self.cols, self.rows)
 
     def lattice(self) -> np.ndarray[tuple[int, ...], np.dtype[np.intp]]:
-        """Places (n, 2) of the points in whole pitches, rows one after the other: their order is the points' id.
-
-        Of tags, four corners each, even places are their upper and left sides.
-        """
+        """Places (n, 2) of the points in whole pitches, rows one after the other: their order is the points' id. Of
+        tags, four corners each, even places are their upper and left sides."""
         if self.kind == "aprilgrid":
             row, column = np.divmod(np.arange(self.cols * self.rows), self.cols)
             tag = 2 * np.column_stack([column, row])
@@ -122,10 +120,8 @@ class BoardSpec:
 
 
 def parse_board(text: str, single_tag: bool = False) -> BoardSpec:
-    """The board of a name; ConfigError says which part of the name is wrong and how it should look.
-
-    With `single_tag` one AprilTag is a board, too, such as apriltag:36h11:50mm: its four corners are the points.
-    """
+    """The board of a name; ConfigError says which part of the name is wrong and how it should look. With `single_tag`
+    one AprilTag is a board, too, such as apriltag:36h11:50mm: its four corners are the points."""
     parts = text.strip().split(":")
     if single_tag and parts[0] == "apriltag":
         return _single_tag(text, parts)

@@ -152,10 +152,8 @@ class StripeStream:
 
 
 def around_stripe(image: Image, profile: StripeProfile, like: StripeProfile) -> Image:
-    """The picture (h, w), black beyond `KEPT_PX` of its stripe: a sixth of its bytes.
-
-    The picture itself where it would not give the same `profile` again, to the last bit, or was read carefully.
-    """
+    """The picture (h, w), black beyond `KEPT_PX` of its stripe: a sixth of its bytes. The picture itself where it would
+    not give the same `profile` again, to the last bit, or was read carefully."""
     rows = profile.rows
     if not len(rows) or profile.rival is not None:
         return image

@@ -87,10 +87,8 @@ class Picture:
 
 
 def read_colours(path: Path) -> Taken:
-    """The picture of a file as it was taken: (h, w), or (h, w, 3) with red first; 8 or 16 bits.
-
-    Raises `PictureRefused` for a file that is no picture.
-    """
+    """The picture of a file as it was taken: (h, w), or (h, w, 3) with red first; 8 or 16 bits. Raises `PictureRefused`
+    for a file that is no picture."""
     # As the sensor has it, however the camera was held: `read_picture` reads it so, too.
     flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     image: Any = cv2.imread(str(path), flags)
@@ -169,10 +167,8 @@ def trimmed_square(counts: NDArray[np.int64], total: int) -> float:
 
 @compiled
 def pixel_noise(image: Image, gain_dn: float, declared_dn2: float) -> tuple[float, float]:
-    """(variance without photons, whole variance) of a pixel of an 8-bit image's background, DN².
-
-    The first is at least `declared_dn2`, more where the picture is noisier than its photons explain.
-    """
+    """(variance without photons, whole variance) of a pixel of an 8-bit image's background, DN². The first is at least
+    `declared_dn2`, more where the picture is noisier than its photons explain."""
     lines, n = image.shape
     # Neighbours two by two, counted by how far they differ.
     counts = np.zeros(256, np.int64)

@@ -11,10 +11,8 @@ if TYPE_CHECKING:
 
 
 def render(package: str, name: str, **values: object) -> str:
-    """The Jinja2 template `name` that lies in `package`, with these values: all of them are escaped, but for TOML.
-
-    `raw | base64` writes bytes for a `data:` address. Raises `jinja2.UndefinedError` for a value that is not given.
-    """
+    """The Jinja2 template `name` that lies in `package`, with these values: all of them are escaped, but for TOML. `raw
+    | base64` writes bytes for a `data:` address. Raises `jinja2.UndefinedError` for a value that is not given."""
     return _environment(package).get_template(name).render(values)
 
 

@@ -81,10 +81,8 @@ class RtdeSession:
                 return
 
     def send_state(self, view: RegisterView, tick: int, late: int = 0) -> None:
-        """Send a data packet for every output recipe that is due at this tick, `late` ticks after this one.
-
-        A client that does not keep up misses packets, as it does on a controller.
-        """
+        """Send a data packet for every output recipe that is due at this tick, `late` ticks after this one. A client
+        that does not keep up misses packets, as it does on a controller."""
         for recipe in self._outputs:
             if tick % recipe.every == 0:
                 self._held.append((tick, recipe.packet(view)))
@@ -196,9 +194,7 @@ class RtdePeer:
         self, model: ArmModel, clock: WorldClock, host: str | None = None, programs: Path | None = None
     ) -> None:
         """Bind the ports on `host`, or on the first free address of `TcpPorts`; `programs` as for `DashboardServer`.
-
-        Raises OSError when an address or every address is taken.
-        """
+        Raises OSError when an address or every address is taken."""
         self._model = model
         self._clock = clock
         self._registers = Registers()
@@ -232,10 +228,8 @@ class RtdePeer:
         self._ports.close()
 
     def fault(self, name: str) -> None:
-        """Cause a fault of `FAULTS`; ValueError for another name.
-
-        `arm.late_states`: from now on every state comes `LATE_S` after it was measured and stamped, on all connections.
-        """
+        """Cause a fault of `FAULTS`; ValueError for another name. `arm.late_states`: from now on every state comes
+        `LATE_S` after it was measured and stamped, on all connections."""
         if name not in FAULTS:
             raise ValueError(f"unknown arm fault {name!r}; known: {', '.join(FAULTS)}")
         self._late = round(LATE_S / PERIOD)

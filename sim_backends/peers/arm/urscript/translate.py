@@ -13,10 +13,8 @@ from itertools import pairwise
 
 
 class ScriptError(Exception):
-    """The text is no URScript: it does not compile, and nothing of it is run.
-
-    `line` and `column` count from 1, 0 where they are not known; `told` is how a controller says it to its clients.
-    """
+    """The text is no URScript: it does not compile, and nothing of it is run. `line` and `column` count from 1, 0 where
+    they are not known; `told` is how a controller says it to its clients."""
 
     def __init__(self, words: str, line: int = 0, column: int = 0, told: str = "") -> None:
         super().__init__(words)

@@ -29,10 +29,8 @@ def down(x: float, y: float, z: float) -> pin.SE3:
 
 
 def link_frames(joints: Joints, table: DenavitHartenberg | LinkTable | None = None) -> list[np.ndarray]:
-    """Base, the six frames that turn with a joint, and the flange, (4, 4).
-
-    By a table, as drawn that of the UR10e, multiplied out with plain matrices, without Pinocchio.
-    """
+    """Base, the six frames that turn with a joint, and the flange, (4, 4). By a table, as drawn that of the UR10e,
+    multiplied out with plain matrices, without Pinocchio."""
     table, frames, pose = table or DenavitHartenberg(), [np.eye(4)], np.eye(4)
     for q, d, a, alpha in zip(joints, table.d, table.a, table.alpha, strict=True):
         c, s, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)

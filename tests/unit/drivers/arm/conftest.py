@@ -15,10 +15,8 @@ from tests.support.wire.shared_arm import shared_arm
 
 @pytest.fixture
 def dashboard():
-    """Starts a dashboard server on a free loopback address that says `answer(question)`; None: nothing.
-
-    Gives a connected dashboard of the driver's, and what it asks.
-    """
+    """Starts a dashboard server on a free loopback address that says `answer(question)`; None: nothing. Gives a
+    connected dashboard of the driver's, and what it asks."""
     for number in itertools.count(200):
         with suppress(OSError):
             listener = socket.create_server((f"127.0.0.{number}", 29999))

@@ -24,10 +24,8 @@ def homed(bench: Bench) -> Bench:
 
 @pytest.fixture
 def module() -> Iterator[Callable[..., str]]:
-    """Starts a module that gives `answer(request)` to each request, but tells its settings as they were set.
-
-    `settings` are those that it begins with, `stubborn` those that it keeps. Returns its URL.
-    """
+    """Starts a module that gives `answer(request)` to each request, but tells its settings as they were set. `settings`
+    are those that it begins with, `stubborn` those that it keeps. Returns its URL."""
     listener = socket.create_server(("127.0.0.1", 0))
     threads: list[threading.Thread] = []
 

@@ -19,10 +19,8 @@ DURATION = 4.0
 
 
 def readings(n: int, late: float, share: float, seed: int, speed: float = SPEED) -> tuple[Vector, Vector, Vector]:
-    """Readings of a motion that is at 0 m at time 0 s: times, positions, round trips.
-
-    Ways to and fro take up to 0.4 ms each; of a `share` of the replies the way back takes `late` s more.
-    """
+    """Readings of a motion that is at 0 m at time 0 s: times, positions, round trips. Ways to and fro take up to 0.4 ms
+    each; of a `share` of the replies the way back takes `late` s more."""
     rng = np.random.default_rng(seed)
     asked = np.linspace(0.0, DURATION, n)
     held = asked + rng.uniform(0.0, 0.0004, n)

@@ -69,10 +69,8 @@ class StripeChain:
 
 
 def respond(picture: NDArray[np.float32], scale: float, along: float) -> NDArray[np.float32]:
-    """How far, in DN, each place of `picture` (m, n) stands above both its sides, for a stripe of σ `scale` px.
-
-    Rows are blurred by `along` px.
-    """
+    """How far, in DN, each place of `picture` (m, n) stands above both its sides, for a stripe of σ `scale` px. Rows
+    are blurred by `along` px."""
     across = cv2.getGaussianKernel(2 * int(np.ceil(2 * max(0.5, 0.6 * scale))) + 1, max(0.5, 0.6 * scale))
     rows = cv2.getGaussianKernel(2 * int(2.5 * along) + 1, along or 1.0)
     smooth = cv2.sepFilter2D(picture, cv2.CV_32F, across, rows, borderType=cv2.BORDER_REPLICATE)
@@ -86,9 +84,7 @@ def candidates(
     part: NDArray[np.float32], rows: NDArray[np.intp], scales: tuple[float, ...], along: float
 ) -> Candidates:
     """What looks like a stripe of one of `scales` in the rows of `part` (m, n), in DN, which are `rows` of the picture.
-
-    Neighbouring rows are blurred by `along` px.
-    """
+    Neighbouring rows are blurred by `along` px."""
     n = part.shape[1]
     best = np.full(part.shape, -np.inf, np.float32)
     answer = np.zeros(part.shape, np.float32)
@@ -233,10 +229,8 @@ class CoarseLines(NamedTuple):
 
 
 def coarse(value: NDArray[np.float32]) -> CoarseLines:
-    """Candidates and chain through some rows of a plane (lines, n), of at most COARSE_COLUMNS pixels.
-
-    Where there is hardly a line to see, rows are blurred more: what is noisy is often straight.
-    """
+    """Candidates and chain through some rows of a plane (lines, n), of at most COARSE_COLUMNS pixels. Where there is
+    hardly a line to see, rows are blurred more: what is noisy is often straight."""
     look = _coarse(value, ALONG)
     if look.chain.score > WEAK_SCORE:
         return look

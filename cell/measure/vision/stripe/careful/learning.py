@@ -34,9 +34,7 @@ def learn_profile(
     plane: Plane, lines: NDArray[np.intp], starts: Array, width: float, noise: Noise
 ) -> tuple[Shape, float, Noise]:
     """The profile of `lines` (m,) about `starts` (m,) px, how much its scale differs from line to line, and the noise.
-
-    `width` is the σ in px to begin with. A Gaussian comes back where the lines show nothing else, or are too few.
-    """
+    `width` is the σ in px to begin with. A Gaussian comes back where the lines show nothing else, or are too few."""
     if len(lines) > MOST_LINES:
         some = _runs(len(lines), MOST_LINES)
         lines, starts = lines[some], starts[some]

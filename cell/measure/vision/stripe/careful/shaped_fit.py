@@ -69,9 +69,7 @@ def gaussian(width: float, reach: float | None = None) -> Shape:
 
 def learn(x: Array, value: Array, weight: Array, width: float, reach: float) -> Shape:
     """The profile that samples `value` (m,) of height about 1 at `x` (m,) px from the centre show, with `weight` (m,).
-
-    `width` is that of the Gaussian from which it is taken to differ, `reach` how far to look, both in px.
-    """
+    `width` is that of the Gaussian from which it is taken to differ, `reach` how far to look, both in px."""
     spacing = width / KNOTS_PER_WIDTH
     count = int(np.ceil(reach / spacing))
     knots = np.arange(-count - 3, count + 4) * spacing
@@ -108,9 +106,7 @@ def _roughness(size: int) -> Array:
 @compiled
 def _gather(place: Array, value: Array, weight: Array, band: Array, right: Array) -> None:  # pragma: no cover
     """Adds the samples' normal equations for cubic splines on whole numbers: upper `band` (4, size), `right` (size,).
-
-    `place` (m,) counts from the low end of what is looked at, where the last piece of the first spline begins.
-    """
+    `place` (m,) counts from the low end of what is looked at, where the last piece of the first spline begins."""
     basis = np.empty(4)
     for n in range(len(place)):
         first = min(max(int(place[n]), 0), len(right) - 4)
@@ -224,10 +220,8 @@ class Fitted:
 def fit_shape(
     plane: Plane, lines: NDArray[np.intp], starts: Array, shape: Shape, noise: Noise, scale_prior: float
 ) -> Fitted:
-    """Fit `lines` (m,) of `plane` from `starts` (m,) px; the scale's logarithm is 0 ± `scale_prior`.
-
-    Unknown are centre, amplitude, scale and a linear background.
-    """
+    """Fit `lines` (m,) of `plane` from `starts` (m,) px; the scale's logarithm is 0 ± `scale_prior`. Unknown are
+    centre, amplitude, scale and a linear background."""
     n = plane.value.shape[1]
     half = int(np.ceil(shape.reach)) + 1
     offset = np.arange(-half, half + 1)

@@ -97,9 +97,7 @@ def carried(fitted: Fitted, variance: Array, correlation: Array) -> Array:
 
 def wander(centres: Array, sigma: Array) -> float:
     """By which factor the centres (lines,) scatter about a smooth line beyond their `sigma`; NaN where there is none.
-
-    Fourth differences of lines 1, 2, 4, 8 and 16 apart: what neighbours share shows at the wider ones.
-    """
+    Fourth differences of lines 1, 2, 4, 8 and 16 apart: what neighbours share shows at the wider ones."""
     largest = 1.0
     for lag in LAGS_ALONG:
         span = 4 * lag

@@ -186,10 +186,8 @@ def find_line(
     image: Image, seen: Image, dark: Shade, r: int, saturation: int, least_peak: float, window: Floats,
     rises: Image, start: Array,
 ) -> bool:  # fmt: skip
-    """Start values of line `r` into start[r] (CANDIDATES, START), which is 0 before, as `find_lines` says.
-
-    True when it has two peaks. `window` (n,) and `rises` (n,) are overwritten.
-    """
+    """Start values of line `r` into start[r] (CANDIDATES, START), which is 0 before, as `find_lines` says. True when it
+    has two peaks. `window` (n,) and `rises` (n,) are overwritten."""
     row = seen[r]
     top = largest(seen, r, 0, len(row))
     if top < least_peak:

@@ -295,10 +295,8 @@ def influence(
 
 @compiled
 def _begin(s: Floats, start: Array, widths: Array, log_widths: Array, lines: Whole, n: int, origins: Whole) -> int:
-    """Starts of the lanes from their `lines`' peaks in `find_lines`, and their origins (LANES,).
-
-    Returns how far from its origin, in px, the lane looks that looks farthest.
-    """
+    """Starts of the lanes from their `lines`' peaks in `find_lines`, and their origins (LANES,). Returns how far from
+    its origin, in px, the lane looks that looks farthest."""
     farthest = 0
     for j in range(LANES):
         r = lines[j]

@@ -126,9 +126,7 @@ def test_who_wants_the_end_of_a_way_is_asked_all_along(cell: VirtualCell, way):
 
 class LateVehicle:
     """The simulated vehicle behind a bus that once, at the end of its way unseen, hands on nothing new for a while.
-
-    With `looks_new` what it hands on is old, but seems to be of now, as from an adapter that holds it back.
-    """
+    With `looks_new` what it hands on is old, but seems to be of now, as from an adapter that holds it back."""
 
     def __init__(self, cell: VirtualCell, begins: float, lasts: float, looks_new: bool) -> None:
         self._looks_new = looks_new

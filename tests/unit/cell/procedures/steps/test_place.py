@@ -268,10 +268,8 @@ def test_a_touch_within_what_is_stated_is_placed_and_told(too_low: float):
 
 @pytest.mark.parametrize("told", [True, False])
 def test_a_stiff_touch_as_soon_as_it_is_felt_for_is_refused_with_the_part_held(site: Site, told: bool, monkeypatch):
-    """The way on which the force grows is too short to tell where it began; where it ended tells enough.
-
-    Also for an arm that tells too few states on that way.
-    """
+    """The way on which the force grows is too short to tell where it began; where it ended tells enough. Also for an
+    arm that tells too few states on that way."""
     if not told:
         monkeypatch.setattr(touch_height, "LEAST_STATES", 10_000)
     touch = site.cell.world.arm.contact

@@ -216,10 +216,8 @@ def spoiled(cell: VirtualCell, covered: bool) -> None:
 def test_a_part_of_which_a_piece_broke_off_or_that_is_covered_is_told_though_the_rest_lies_in_its_place(
     lying_part: Lying, covered: bool
 ):
-    """The job names no feature: a robust fit passes over a corner of 10 mm, and over what lies there.
-
-    Nor is it gripped again.
-    """
+    """The job names no feature: a robust fit passes over a corner of 10 mm, and over what lies there. Nor is it gripped
+    again."""
     site = lying_part(also="corrections = 2", changed=lambda cell: spoiled(cell, covered))
     with pytest.raises(MisplacedError, match=r"lies 0.\d\d ± 0.0\d mm off") as told:
         site.looked(pin.SE3.Identity())

@@ -57,10 +57,8 @@ def sweep(
     meddle: Meddle = nothing, late: float = 0.0, camera_late: float = 0.0, errors: SweepErrors = ERRORS,
     made: VirtualCell | None = None, scan: ScanSection = SCAN,
 ) -> Swath:  # fmt: skip
-    """Sweep 20 mm, at 20 mm/s if not told otherwise; half-way `meddle` is called once.
-
-    Replies of rail and camera come so many s late.
-    """
+    """Sweep 20 mm, at 20 mm/s if not told otherwise; half-way `meddle` is called once. Replies of rail and camera come
+    so many s late."""
     cell, mover, pose = ready(made)
     cell.rail.late, cell.scan_camera.late = late, camera_late
     taken: list[int] = []
@@ -196,10 +194,8 @@ def swept_by_arm(
     made: VirtualCell | None = None,
     errors: SweepErrors = ERRORS,
 ) -> tuple[Swath, float]:
-    """Sweep 20 mm at 20 mm/s, each state of the arm `late` s late; and how far off the lines truly lie, m.
-
-    `meddle` is called with each of ten frames from the middle.
-    """
+    """Sweep 20 mm at 20 mm/s, each state of the arm `late` s late; and how far off the lines truly lie, m. `meddle` is
+    called with each of ten frames from the middle."""
     cell, mover, start = ready(made)
     devices, arm, camera = cell.devices, cell.arm, cell.scan_camera
     end = from_parts(np.array([0.0, SCAN.length, 0.0])) * start
