@@ -129,13 +129,18 @@ def decide(
     best = _best(fits)
     if not best.score < AGREES:
         raise RefusedError(_none_agrees(fits, pitch))
-    rival = next((f for f in fits if f is not best and not _same(f, best, boards)), None)
-    if rival is not None:
-        # The same poses in another file are no other meaning.
-        rival = next((f for f in fits if f.series is best.series and _same(f, rival, boards)), rival)
-        if not _clearly_worse(rival, best):
-            raise RefusedError(_question(best, rival))
+    rival = _rival(best, fits, boards)
+    if rival is not None and not _clearly_worse(rival, best):
+        raise RefusedError(_question(best, rival))
     return Decision(best, rival, sorted(own))
+
+
+def _rival(best: Fit, fits: Sequence[Fit], boards: dict[int, list[pin.SE3]]) -> Fit | None:
+    """The next best that means something else: the same poses in another file do not."""
+    rival = next((f for f in fits if f is not best and not _same(f, best, boards)), None)
+    if rival is None:
+        return None
+    return next((f for f in fits if f.series is best.series and _same(f, rival, boards)), rival)
 
 
 def _best(fits: Sequence[Fit]) -> Fit:
