@@ -26,6 +26,8 @@ STIFFNESS = 20e3
 """Vertical stiffness of a flat contact over the whole underside, N/m."""
 GRIP_REACH = 0.005
 """How far, m, the claw may be from the part's place in it and still grip it."""
+GRIP_TURN = 0.3
+"""How far, rad, the claw may be turned against the part and still grip it."""
 FINGERS_ABOVE = 0.015
 """The fingertips end this far, m, from the part's underside."""
 LEAST_TOUCHING = 40
@@ -185,7 +187,9 @@ class PartContact:
         if self._world_from_part is None:
             return
         found = inverse(world_from_flange) @ self._pose(world_from_flange)
-        if np.linalg.norm(found[:3, 3] - self._flange_from_part[:3, 3]) <= GRIP_REACH:
+        turned = found[:3, :3].T @ self._flange_from_part[:3, :3]
+        aside = np.linalg.norm(found[:3, 3] - self._flange_from_part[:3, 3])
+        if aside <= GRIP_REACH and np.trace(turned) >= 1.0 + 2.0 * math.cos(GRIP_TURN):
             self._flange_from_part, self._lying = found, False
             self._world_from_part = self._base_from_part = None
             self._held_box = self._box(held=True)

@@ -132,12 +132,13 @@ def test_a_part_put_down_beside_its_place_rests_higher_on_its_first_contact():
     assert gap.min() > -2e-5 and gap.min() < 2e-4
 
 
-def test_the_claw_grips_again_only_within_its_reach():
+def test_the_claw_grips_again_only_within_its_reach_and_not_across_the_part():
     part, target = contact()
     part.set_claw(False, flange_for(target))
-    part.set_claw(True, flange_for(raised(target, dz=0.02)))
-    assert not part.held
-    part.set_claw(False, flange_for(raised(target, dz=0.02)))
+    for off in (raised(target, dz=0.02), target @ turned((0.0, 0.0, 0.4), (0.0, 0.0, 0.0))):
+        part.set_claw(True, flange_for(off))
+        assert not part.held
+        part.set_claw(False, flange_for(off))
     part.set_claw(True, flange_for(raised(target, dz=0.003)))
     assert part.held
     lifted = part.part_pose(flange_for(raised(target, dz=0.103)))
