@@ -144,7 +144,9 @@ class _Cells:
     def of(
         cls, cloud: Cloud, nominal: NominalSurface, pose: pin.SE3, times: Array, base_from_vehicle: pin.SE3
     ) -> Self | None:
-        scan, (lines, rows) = Scan.of(cloud, MOST_POINTS), cloud.subsample(MOST_POINTS)
+        # However many lines there are, each has enough for its cells.
+        most = max(MOST_POINTS, 2 * LEAST_POINTS * ROW_GROUPS * cloud.shape[0])
+        scan, (lines, rows) = Scan.of(cloud, most), cloud.subsample(most)
         found = correspondences(pose, scan, nominal, GATE_M)
         line, row, normals, points = lines[found.index], rows[found.index], found.normals, scan.points[found.index]
         cell = line * ROW_GROUPS + row * ROW_GROUPS // cloud.shape[1]

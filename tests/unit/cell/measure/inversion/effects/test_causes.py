@@ -115,6 +115,17 @@ def test_the_likeliest_cause_is_the_one_that_was_planted(placed_pot: JobRecord, 
     assert NAMES[effect][1] in first and "To tell them apart, " in other
 
 
+def test_a_scan_of_many_lines_has_causes_too(placed_pot: JobRecord):
+    cloud = planted(placed_pot, "mode hop", 1)
+    pose, times = inverted(placed_pot, cloud)[0], placed_pot.results["laser_sweep"].times
+    often = 600 // cloud.shape[0]
+    arrays = ("points", "stripe_spread", "rail_spread", "centres", "rail", "rejected", "flanges", "sweeps")
+    dense = replace(cloud, **{name: np.repeat(getattr(cloud, name), often, axis=0) for name in arrays})
+    when = np.interp(np.arange(dense.shape[0]) / often, np.arange(len(times)), times)
+    found = find_causes(dense, pot()[1], pose, when, VEHICLE)
+    assert found and found[0].kind == "laser"
+
+
 def test_a_scan_that_fits_has_no_cause(placed_pot: JobRecord):
     cloud = placed_pot.results["reconstruct"].cloud
     pose, text = inverted(placed_pot, cloud)
