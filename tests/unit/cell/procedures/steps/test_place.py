@@ -311,6 +311,17 @@ def test_a_claw_that_lost_its_part_does_not_go_down(site: Site):
     assert min(site.heights) > site.arm.state().flange[2] - 0.002
 
 
+def test_a_part_that_is_lost_as_it_touches_is_not_told_as_released(site: Site):
+    def note(part: PartProgress) -> None:
+        site.noted.append(part.state)
+        site.cell.world.part.take_away()
+        site.cell.clock.sleep(0.1)
+
+    with pytest.raises(RefusedError, match="the claw lost the part as it was set down"):
+        site.place(note=note)
+    assert site.noted == [PartState.UNKNOWN]
+
+
 def test_a_job_with_an_empty_claw_ends_before_anything_moves(site: Site):
     site.cell.devices.claw.bare.release()
     workplace = Workplace(
