@@ -225,11 +225,10 @@ class Placing:
     def _release(self, reached: pin.SE3) -> None:
         self.progress(0.8, "releasing")
         part = self.part
+        require_in_claw(self.claw, part, self.note, "as it was set down")
         part.state, part.where = PartState.UNKNOWN, reached * self.job.grasp.flange_from_part.se3()
         # Whoever finds this run cut short here must not take the part as still held.
         self.note(part)
-        if not self.claw.holding:
-            raise RefusedError("the claw lost the part as it was set down. Look where it is, and at the fingers")
         self.claw.release()
         part.state = PartState.RELEASED
         self.note(part)
