@@ -142,3 +142,14 @@ def test_a_camera_in_the_flange_is_a_doubt():
     result = calibrate_pairs([(flange, flange.inverse() * stands) for flange in flanges]).as_dict()
     assert [c["verdict"] for c in result["checks"] if c["name"] == "a camera at the origin"] == ["doubt"]
     assert "Invert it" in verdicts(result)[1]
+
+
+def test_a_board_that_was_moved_half_way_is_in_the_stated_deviation():
+    pairs = sorted(given_pairs(scene(1, count=20, laser=False)), key=lambda pair: pair[0].translation[0])
+    moved = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.03]))
+    for k in range(10, 20):
+        base_from_camera = pairs[k][0] * FLANGE_FROM_CAMERA
+        pairs[k] = pairs[k][0], base_from_camera.actInv(moved * base_from_camera * pairs[k][1])
+    found = calibrate_pairs(pairs).as_dict()["hand_eye"]
+    off = np.array(found["translation_mm"]) - 1e3 * FLANGE_FROM_CAMERA.translation
+    assert np.linalg.norm(off) < 2.0 * np.linalg.norm(found["sigma_mm"])
