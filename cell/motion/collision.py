@@ -188,7 +188,8 @@ class CollisionModel:
             joint, placement = body.parent, body.placement
             if joint == FLANGE:
                 joint, placement = 6, kinematics.joint6_from_flange * placement
-            self._geometry.addGeometryObject(pin.GeometryObject(body.name, joint, placement, _shape(body)))
+            shape = coal.Box(*body.size) if body.radius is None else coal.Capsule(body.radius, body.size[2])
+            self._geometry.addGeometryObject(pin.GeometryObject(body.name, joint, placement, shape))
         self.pairs: list[Pair] = []
         """The pairs of bodies that are looked at, in the order of `distances`."""
         for i, first in enumerate(bodies):
@@ -288,10 +289,6 @@ def _corners(body: Body, placement: pin.SE3) -> tuple[NDArray[np.float64], float
 
 def _array(joints: Joints) -> NDArray[np.float64]:
     return np.asarray(joints, dtype=np.float64)
-
-
-def _shape(body: Body) -> coal.ShapeBase:
-    return coal.Box(*body.size) if body.radius is None else coal.Capsule(body.radius, body.size[2])
 
 
 def _may_touch(first: Body, second: Body) -> bool:

@@ -204,7 +204,7 @@ def read_quickly(
         widths = np.minimum(np.maximum(widths * widening, low), high)
         contrast = seen_contrast if contrast is None else contrast
         grain = seen_grain if grain is None else grain
-    run(found, contrast, correlation(grain) if contrast > 0 and grain else NO_LAGS)
+    run(found, contrast, _lags(contrast, grain))
     saturated, excess = np.empty(len(work), np.bool_), 1 + SECOND_ORDER * contrast**2
     believe(
         fitted, start, work.shape[1], low, high, least=0.5 * least, excess=excess, double=double, saturated=saturated
@@ -238,6 +238,10 @@ def _is_ordinary(fitted: Array, start: Array, work: Image, *, shade: Image, seen
         and is_surface_even(shade, fitted, found)
         and not is_textured(seen)
     )
+
+
+def _lags(contrast: float, grain: float | None) -> NDArray[np.float32]:
+    return correlation(grain) if contrast > 0 and grain else NO_LAGS
 
 
 def _is_like(profile: StripeProfile, like: StripeProfile | None) -> bool:
