@@ -15,7 +15,7 @@ import pinocchio as pin
 from cell.apps.recordings import solution
 from cell.apps.recordings.agreement import UNITS, Decision, decide, scale_problem
 from cell.apps.recordings.conventions import check_reading, why_not
-from cell.apps.recordings.frames import RecordedFrame, near, read_frames
+from cell.apps.recordings.frames import SAME_RAD, RecordedFrame, near, read_frames
 from cell.apps.recordings.pairs import calibrate_pairs, read_pose_pairs
 from cell.apps.recordings.result import Figures, RecordedResult
 from cell.apps.recordings.series import Listing, Series, in_order_of_views, list_folder, match_series, read_series
@@ -28,8 +28,6 @@ from cell.measure.vision.stripe.planes import LaserChannel
 from drivers.errors import ConfigError, RefusedError
 
 LEAST_POSES, FARTHEST_M = 3, 20.0
-# Poses of an arm that stands still, read twice, are no further apart.
-SAME_M, SAME_RAD = 0.5e-3, 2e-3
 
 
 @dataclass
@@ -258,7 +256,7 @@ def _compare_copies(frames: Sequence[RecordedFrame]) -> None:
         first, own = frame.shows, frame.base_from_flange
         if first is None or own is None or first.base_from_flange is None:
             continue
-        if near(first.base_from_flange, own, SAME_M, SAME_RAD):
+        if near(first.base_from_flange, own, turn=2 * SAME_RAD):
             continue
         apart = difference(first.base_from_flange, own)
         way, turn = float(np.linalg.norm(apart[:3])), float(np.linalg.norm(apart[3:]))

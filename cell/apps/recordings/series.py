@@ -255,7 +255,10 @@ def _match_pictures(one: Series, listing: Listing, linked: dict[str, int]) -> No
         found = _match([listing.name(listing.pictures[k]) for k in which], labels, [r.time for r in one.records])
     one.by, one.of = found.by, {which[k]: one.records[i] for k, i in found.of.items()}
     one.alone = [one.records[i] for i in found.alone]
-    one.doubled = {which[k]: [one.records[i] for i in hits] for k, hits in found.doubled.items()}
+    several = {which[k]: [one.records[i] for i in hits] for k, hits in found.doubled.items()}
+    # The same row twice is one.
+    one.of |= {k: r[0] for k, r in several.items() if all(np.array_equal(r[0].numbers, o.numbers) for o in r)}
+    one.doubled = {k: records for k, records in several.items() if k not in one.of}
 
 
 def _labels(one: Series, listing: Listing, single: bool) -> list[str]:

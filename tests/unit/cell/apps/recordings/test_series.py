@@ -80,7 +80,7 @@ def test_times_match_poses_to_pictures(tmp_path, pictures, seen):
             assert np.abs(frame.base_from_flange.homogeneous - pose).max() < 1e-6
 
 
-def test_names_with_a_sign_are_matched_as_they_are(tmp_path, pictures, seen):
+def test_names_with_a_sign_are_matched_as_they_are_and_the_same_row_twice_is_one(tmp_path, pictures, seen):
     chosen = list(zip(sorted(pictures.iterdir()), POSES, ("-20", "-10", "10", "20"), strict=False))
     (tmp_path / "tilts").mkdir()
     names = {}
@@ -88,7 +88,7 @@ def test_names_with_a_sign_are_matched_as_they_are(tmp_path, pictures, seen):
         (tmp_path / f"tilts/tilt_{tilt}.png").symlink_to(path)
         names[f"tilt_{tilt}.png"] = seen[path.name]
     lines = [f"tilt_{tilt}.png " + row([*pose[:3, 3], *quaternion(pose)]) for _, pose, tilt in reversed(chosen)]
-    (tmp_path / "poses.txt").write_text("\n".join(lines))
+    (tmp_path / "poses.txt").write_text("\n".join([*lines, lines[1]]))
     frames, understood, _ = understand(tmp_path, names)
     assert understood.about["matched_by"] == "name"
     expected = {f"tilts/tilt_{tilt}.png": pose for _, pose, tilt in chosen}
