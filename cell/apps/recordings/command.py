@@ -68,7 +68,7 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     # A plan tells of boards and poses; to read stripes takes seconds for each picture.
     frames, channel = read_frames(listing, spec, links, None if options.plan else options.laser)
     late = [one for one in series if not one.of and in_order_of_views(one, frames)]
-    unread += _still_strange(strange, late)
+    unread += [(name, reason) for name, reason in strange if name not in [one.name for one in late]]
     result = RecordedResult(spec.name, laser=channel.figures())
     result.notes += _doubtful_lines(frames)
     result.unread = [{"name": name, "reason": reason} for name, reason in [*listing.unread, *unread]]
@@ -83,11 +83,6 @@ def _require_none_of_pictures(options: Options, folder: Path) -> None:
     of = {"poses": options.poses, "pose-field": options.pose_field, "camera": options.camera, "laser": laser}
     if given := [f"--{name}" for name, value in of.items() if value is not None]:
         raise ConfigError(f"{', '.join(given)}: {folder} holds pairs of poses in m, no pictures; leave it out")
-
-
-def _still_strange(strange: Sequence[tuple[str, str]], late: Sequence[Series]) -> list[tuple[str, str]]:
-    """What belongs to no picture after those that went to the pictures that were left."""
-    return [(name, reason) for name, reason in strange if name not in [one.name for one in late]]
 
 
 def _what_is_missing(listing: Listing) -> str:

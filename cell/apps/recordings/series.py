@@ -256,9 +256,13 @@ def _match_pictures(one: Series, listing: Listing, linked: dict[str, int]) -> No
     one.by, one.of = found.by, {which[k]: one.records[i] for k, i in found.of.items()}
     one.alone = [one.records[i] for i in found.alone]
     several = {which[k]: [one.records[i] for i in hits] for k, hits in found.doubled.items()}
-    # The same row twice is one.
-    one.of |= {k: r[0] for k, r in several.items() if all(np.array_equal(r[0].numbers, o.numbers) for o in r)}
+    one.of |= {k: records[0] for k, records in several.items() if _are_one(records)}
     one.doubled = {k: records for k, records in several.items() if k not in one.of}
+
+
+def _are_one(records: Sequence[PoseRecord]) -> bool:
+    """Whether it is the same row again."""
+    return all(np.array_equal(record.numbers, records[0].numbers) for record in records)
 
 
 def _labels(one: Series, listing: Listing, single: bool) -> list[str]:
