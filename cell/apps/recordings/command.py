@@ -16,7 +16,7 @@ from cell.apps.recordings import solution
 from cell.apps.recordings.agreement import UNITS, Decision, decide, scale_problem
 from cell.apps.recordings.conventions import check_reading, why_not
 from cell.apps.recordings.frames import SAME_RAD, RecordedFrame, near, read_frames
-from cell.apps.recordings.pairs import calibrate_pairs, read_pose_pairs
+from cell.apps.recordings.pairs import Pair, calibrate_pairs, read_pose_pairs
 from cell.apps.recordings.result import Figures, RecordedResult
 from cell.apps.recordings.series import Listing, Series, in_order_of_views, list_folder, match_series, read_series
 from cell.measure.geometry.camera import CameraModel
@@ -56,11 +56,7 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     listing = list_folder(folder)
     pairs = read_pose_pairs(listing)
     if pairs and (spec is None or not listing.pictures):
-        _require_none_of_pictures(options, folder)
-        result = calibrate_pairs(pairs, options.setup)
-        if listing.pictures:
-            result.notes.append(f"{len(listing.pictures)} pictures were not looked at: --board names no board of them")
-        return RecordedResult(frames=result.frames, notes=result.notes) if options.plan else result
+        return _of_pairs(pairs, listing, options)
     if spec is None or (listing.texts and not listing.pictures):
         raise ConfigError(_what_is_missing(listing))
     series, links, unread = read_series(listing)
@@ -77,12 +73,16 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     return result
 
 
-def _require_none_of_pictures(options: Options, folder: Path) -> None:
-    """Raise ConfigError for what a person said that pairs of poses have nothing of."""
+def _of_pairs(pairs: Sequence[Pair], listing: Listing, options: Options) -> RecordedResult:
+    """The hand-eye of pairs of poses. Raises ConfigError for what a person said that these have nothing of."""
     laser = None if options.laser is LaserChannel.AUTO else "said"
     of = {"poses": options.poses, "pose-field": options.pose_field, "camera": options.camera, "laser": laser}
     if given := [f"--{name}" for name, value in of.items() if value is not None]:
-        raise ConfigError(f"{', '.join(given)}: {folder} holds pairs of poses in m, no pictures; leave it out")
+        raise ConfigError(f"{', '.join(given)}: {listing.folder} holds pairs of poses in m, no pictures; leave it out")
+    result = calibrate_pairs(pairs, options.setup)
+    if listing.pictures:
+        result.notes.append(f"{len(listing.pictures)} pictures were not looked at: --board names no board of them")
+    return RecordedResult(frames=result.frames, notes=result.notes) if options.plan else result
 
 
 def _what_is_missing(listing: Listing) -> str:
