@@ -458,10 +458,8 @@ def item_names(name: str | Path) -> list[str]:
 
 
 def job_path(name: str | Path) -> Path:
-    """The file of a job: a path, or a name: `NAME.toml` of the present folder, else the job of that name that ships.
-
-    So the `pot.toml` that `cell init` wrote is the job `pot` in its folder.
-    """
+    """The file of a job: a path, or a name: `NAME.toml` of the present folder, else the job of that name that ships. So
+    the `pot.toml` that `cell init` wrote is the job `pot` in its folder."""
     name, _ = job_and_item(name)
     path = Path(name)
     if path.suffix == ".toml" or path.is_file():
@@ -477,10 +475,8 @@ def job_path(name: str | Path) -> Path:
 
 
 def require_job_name(name: str) -> None:
-    """`ConfigError` unless this names a job, never a path: `NAME.toml` of the present folder, or one that ships.
-
-    A file of the present folder is a regular one in it; a link to elsewhere and a pipe are none.
-    """
+    """`ConfigError` unless this names a job, never a path: `NAME.toml` of the present folder, or one that ships. A file
+    of the present folder is a regular one in it; a link to elsewhere and a pipe are none."""
     own, _ = job_and_item(name)
     path = job_path(name) if re.fullmatch(r"[\w+-][\w.+-]{0,63}", own) else Path(name)
     if not (ships(path) or (path == Path(f"{own}.toml") and below(Path(), path.name) is not None)):

@@ -24,6 +24,8 @@ from drivers.errors import ConfigError, RefusedError
 Pair = tuple[pin.SE3, pin.SE3]
 """base_from_flange and camera_from_board, in m."""
 LEAST_PAIRS = 4
+CLEARLY = 5.0
+"""Times as much scatter as in the other set-up: then it is not the one that a person named."""
 """Of stops, not of pairs."""
 FARTHEST_M = {"the flange's distance from the base": 10.0, "the board's distance from the camera": 20.0}
 USUAL_SHARE = 0.01
@@ -118,10 +120,8 @@ def calibrate_pairs(pairs: Sequence[Pair], wanted: str | None = None) -> Recorde
 
 
 def _stated(sigma: Array, left_out: float, reach: float) -> Array:
-    """The deviations (6,), in m and rad, of pairs that put the board so far, m, from where the others see it.
-
-    Beyond what is usual that is no chance of single pairs: the board may have been moved in the midst of them.
-    """
+    """The deviations (6,), in m and rad, of pairs that put the board so far, m, from where the others see it. Beyond
+    what is usual that is no chance of single pairs: the board may have been moved in the midst of them."""
     if left_out <= USUAL_SHARE * reach:
         return sigma
     return np.concatenate([np.maximum(sigma[:3], left_out / math.sqrt(3.0)), np.maximum(sigma[3:], left_out / reach)])
@@ -138,15 +138,23 @@ def _in_the_origin(setup: str, found: pin.SE3, reach: float) -> list[QualityChec
 
 
 def _closed_form(pairs: Sequence[Pair], wanted: str | None) -> tuple[str, HandEye, list[pin.SE3]]:
-    """Set-up, hand-eye and flange poses, the camera on the flange or before it, whichever scatters the board less."""
+    """Set-up, hand-eye and flange poses, the camera on the flange or before it: as is `wanted`, or whichever scatters
+    the board less. Raises ConfigError for what is `wanted` where the other scatters it far less."""
     solutions: list[tuple[str, HandEye, list[pin.SE3]]] = []
-    for setup in ("eye_in_hand", "eye_to_hand") if wanted is None else (wanted,):
+    for setup in ("eye_in_hand", "eye_to_hand"):
         flanges = [f if setup == "eye_in_hand" else f.inverse() for f, _ in pairs]
         try:
             solutions.append((setup, solve_hand_eye(flanges, [board for _, board in pairs]), flanges))
         except RefusedError as error:
             raise ConfigError(f"the {len(pairs)} pairs of poses give no hand-eye: {error}") from error
-    return min(solutions, key=lambda solution: solution[1].scatter_m)
+    best = min(solutions, key=lambda solution: solution[1].scatter_m)
+    said = next((solution for solution in solutions if solution[0] == wanted), best)
+    if said[1].scatter_m > CLEARLY * best[1].scatter_m:
+        raise ConfigError(
+            f"--setup {said[0].replace('_', '-')}: the pairs put the board {1e3 * said[1].scatter_m:.0f} mm apart so, "
+            f"and {1e3 * best[1].scatter_m:.1f} mm as {best[0].replace('_', ' ')}; leave --setup out, or invert poses"
+        )
+    return said
 
 
 def _checks(apart: Array, sigma: Array, left_out: float, *, reach: float, count: int) -> list[QualityCheck]:

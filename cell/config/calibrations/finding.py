@@ -84,9 +84,7 @@ def _stored(
     folder: Path, identities: dict[str, str]
 ) -> tuple[list[CellCalibration], list[tuple[str, str]], list[CalibrationEdited]]:
     """The calibrations in `folder`; name and trouble of each file that cannot be read; edited copies of these devices'.
-
-    The file that the cell writes comes first: a copy is of the same age, and lacks what was added since.
-    """
+    The file that the cell writes comes first: a copy is of the same age, and lacks what was added since."""
     own = name_of(identities)
     found: list[CellCalibration] = []
     unreadable: list[tuple[str, str]] = []

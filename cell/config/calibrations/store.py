@@ -310,10 +310,8 @@ def read_calibration(path: Path) -> CellCalibration:
 
 
 def accept_calibration(path: Path, who: str, why: str) -> CellCalibration:
-    """Take an edited file as it is now, and keep in it who did so, when and why.
-
-    `CalibrationStale` when what it says cannot be, `ConfigError` when nothing was changed.
-    """
+    """Take an edited file as it is now, and keep in it who did so, when and why. `CalibrationStale` when what it says
+    cannot be, `ConfigError` when nothing was changed."""
     made, changed = _read(path)
     if not changed:
         raise ConfigError(f"{path} is as it was written; there is no edit to accept")
